@@ -17,7 +17,7 @@ TWIST, WRENCH, POWER = 1e-6, 1e-5, 1e-9
 solve_all = jax.jit(jax.vmap(pj.solve_contacts), compiler_options=AS_USERS)
 
 
-@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_recorded_answers(degree):
     with np.load(RECORD) as file:
         known = {name.removesuffix(f"_{degree}"): file[name] for name in file.files if name.endswith(f"_{degree}")}

@@ -42,16 +42,10 @@ def pushed(name: str) -> tuple[pj.Shape, pj.Trajectory]:
     return shape, push
 
 
-MARKS = {
-    "finger, T": pytest.mark.slow,
-    "jaw": pytest.mark.slow,
-    "pad, L": pytest.mark.slow,
-    "pad, bean": pytest.mark.slow,
-    "rake": pytest.mark.slow,
-}
+QUICK = ("finger, square", "finger, disk")
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in CASES])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in CASES])
 def test_forces_at_the_contact_points_are_the_wrench(name):
     shape, push = pushed(name)
     found = plot.contact_forces(push)

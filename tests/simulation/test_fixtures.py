@@ -75,16 +75,6 @@ def test_a_slider_that_starts_in_a_wall_is_pushed_out():
     assert found.pose[-1, 1] == pytest.approx(0, abs=1e-9)
 
 
-def test_the_order_of_fixtures_does_not_matter():
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        height, rise = rng.uniform(-0.02, 0.02), rng.uniform(-0.03, 0.01)
-        path = straight((-0.09, height), (-0.03, height + rise))
-        pose = jnp.array([0.0, 0.01, rng.uniform(-0.3, 0.3)])
-        one, other = (push(path, pose, 0.3, walls).pose[-1] for walls in ((FLOOR, RIGHT), (RIGHT, FLOOR)))
-        np.testing.assert_allclose(one, other, atol=1e-9)
-
-
 def test_pushes_far_from_fixtures_are_those_without():
     path = straight((-0.07, 0.004), (0.0, 0.004))
     with_walls = push(path, jnp.zeros(3), 0.3, (pj.Wall((0.0, -3.0), (0.0, 1.0)), FAR))

@@ -421,43 +421,6 @@ def test_dissipation_and_friction_cone_at_each_step():
             np.testing.assert_array_equal(push.pose[1:][~moves], push.pose[:-1][~moves])
 
 
-def turned(points: np.ndarray, angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return points @ np.array([[c, s], [-s, c]])
-
-
-@pytest.mark.parametrize("angle", [0.7, -2.9, 9.0])
-def test_moving_the_world_moves_the_push(angle):
-    """The push moves with the world; theta is never wrapped."""
-    shift = np.array([0.3, -0.2])
-    here = fan(50)
-    there = [
-        p._replace(
-            path=turned(p.path, angle) + shift, pose=np.append(turned(p.pose[:2], angle) + shift, p.pose[2] + angle)
-        )
-        for p in here
-    ]
-    for a, b in zip(run_all(here), run_all(there), strict=True):
-        expected = np.concatenate([turned(a.pose[:, :2], angle) + shift, a.pose[:, 2:] + angle], axis=1)
-        np.testing.assert_allclose(b.pose, expected, rtol=0, atol=1e3 * ROUNDING)
-        np.testing.assert_allclose(b.twist, a.twist, rtol=0, atol=1e3 * ROUNDING)
-        np.testing.assert_array_equal(b.mode, a.mode)
-
-
-# Signs of the 15 monomials under y -> -y, tau -> -tau.
-MIRRORED = np.array([1, 1, 1, -1, -1, -1, 1, -1, 1, 1, 1, 1, 1, -1, -1])
-SWAPPED = np.array([0, 1, 3, 2])
-
-
-def test_mirror_image():
-    here = fan(50, pose=np.array([0.0, 0.0, 0.0]))
-    flip = np.array([1.0, -1.0])
-    there = [p._replace(path=p.path * flip, surface=p.surface * MIRRORED, vertices=SQUARE[::-1] * flip) for p in here]
-    for a, b in zip(run_all(here), run_all(there), strict=True):
-        np.testing.assert_allclose(b.pose, a.pose * [1, -1, -1], rtol=0, atol=1e3 * ROUNDING)
-        np.testing.assert_array_equal(b.mode, SWAPPED[a.mode])
-
-
 def test_going_on_is_the_same_as_one_push():
     pushes = fan(50)
     whole = run_all(pushes)

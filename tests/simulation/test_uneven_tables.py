@@ -14,7 +14,7 @@ MODEL = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
 @pytest.fixture(scope="module")
 def push():
     """Slider, hand, path and start."""
-    slider = pj.Slider(pj.Polygon.rectangle(0.09, 0.09), pj.Ellipsoid(np.diag([1.0, 1.0, 1.1]), 0.035))
+    slider = pj.Slider(pj.Disk(0.045), pj.Ellipsoid(np.diag([1.0, 1.0, 1.1]), 0.035))
     return slider, pj.Hand.finger(0.00475), pj.line((-0.05, 0.01), (-0.03, 0.012), 6), jnp.zeros(3)
 
 
