@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 from pushjax._internal.checks import ArrayLike, as_float, check_shape, check_type, common_dtype
 from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import entry_at
-from pushjax.contact.contact_plane import Contact, LimitCurve
+from pushjax._math.vec import Vec2
+from pushjax.contact.contact_plane import LimitCurve
 from pushjax.contact.problem import Contacts, contacts_in_columns
 from pushjax.friction.limit_surface import LimitSurface
 
@@ -30,21 +31,7 @@ def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]
         ValueError: If a shape is wrong, a number is not finite, the normal is not of unit length or the friction is
             negative.
     """
-    return _force_edges(_checked_contacts(np.zeros(2), normal, friction, common_dtype(normal, friction)))
-
-
-def _first(contacts: Contacts) -> Contact:
-    """Return the first contact."""
-    return entry_at(contacts_in_columns(contacts, contacts.friction), 0)
-
-
-@quick_jit
-def _force_edges(contacts: Contacts) -> Float[Array, "2 2"]:
-    """Return the edges of the friction cone of the first contact."""
-    contact = _first(contacts)
-    n, mu = contact.normal, contact.friction
-    edges = jnp.stack([(n + n.perp().scale(ratio)).array() for ratio in (mu, -mu)])
-    return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
+    return _edges(None, _checked_contacts(np.zeros(2), normal, friction, common_dtype(normal, friction)))
 
 
 def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]:
@@ -79,22 +66,21 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
     """
     check_type("surface", surface, LimitSurface)
     dtype = common_dtype(surface, point, normal, friction)
-    return _motion_edges(surface, _checked_contacts(point, normal, friction, dtype))
+    return _edges(surface, _checked_contacts(point, normal, friction, dtype))
 
 
 @quick_jit
-def _motion_edges(surface: LimitSurface, contacts: Contacts) -> Float[Array, "2 2"]:
-    """Return the edges of the motion cone of the first contact."""
-    contact = _first(contacts)
-    curve = LimitCurve.of(surface.form(), contact)
-    edges = []
-    for ratio in (contact.friction, -contact.friction):
-        motion = curve.motion(ratio)
-        # Divided by the larger component first, because the squares below may underflow.
-        motion = motion.scale(1 / jnp.maximum(jnp.abs(motion.x), jnp.abs(motion.y)))
-        motion = motion.scale(1 / jnp.sqrt(motion.dot(motion)))
-        edges.append((contact.normal.scale(motion.x) + contact.normal.perp().scale(motion.y)).array())
-    return jnp.stack(edges)
+def _edges(surface: LimitSurface | None, contacts: Contacts) -> Float[Array, "2 2"]:
+    """The edges of the motion cone of the first contact, or without a surface those of the friction cone."""
+    contact = entry_at(contacts_in_columns(contacts, contacts.friction), 0)
+    ratio = jnp.stack([contact.friction, -contact.friction])
+    edges = Vec2(jnp.ones_like(ratio), ratio)  # (n, t) of both
+    if surface is not None:
+        edges = LimitCurve.of(surface.form(), contact).motion(ratio)
+    # Divided by the larger component first, because the squares below may underflow.
+    edges = edges.scale(1 / jnp.maximum(jnp.abs(edges.x), jnp.abs(edges.y)))
+    edges = edges.scale(1 / jnp.sqrt(edges.dot(edges)))
+    return jnp.stack(contact.normal.scale(edges.x) + contact.normal.perp().scale(edges.y), axis=1)
 
 
 def _checked_contacts(point: ArrayLike, normal: ArrayLike, friction: ArrayLike, dtype: Any) -> Contacts:

@@ -22,6 +22,7 @@ The condition for right is its mirror image. Neither needs an arctangent. (Zhou 
 cross product only.)
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -80,11 +81,7 @@ class LimitCurve(NamedTuple):
 
     def motion(self, s: Scalar) -> Vec2:
         """grad h at (1, s), the motion of the contact point in (n, t): two polynomials of degree d - 1."""
-        d = self.degree
-        return Vec2(
-            _horner([(d - k) * c for k, c in enumerate(self.c[:-1])], s),
-            _horner([k * c for k, c in enumerate(self.c)][1:], s),
-        )
+        return Vec2(_horner(by_normal(self.c), s), _horner(by_tangential(self.c), s))
 
     def second_derivative(self, s: Scalar) -> Scalar:
         """h''(s)."""
@@ -93,6 +90,16 @@ class LimitCurve(NamedTuple):
     def value(self, s: Scalar) -> Scalar:
         """h(s)."""
         return _horner(self.c, s)
+
+
+def by_normal(c: Sequence[Scalar]) -> list[Scalar]:
+    """The derivative by f_n of the form sum_k c_k f_n^(d - k) f_t^k, a form of degree d - 1."""
+    return [(len(c) - 1 - k) * each for k, each in enumerate(c[:-1])]
+
+
+def by_tangential(c: Sequence[Scalar]) -> list[Scalar]:
+    """The derivative by f_t of the form sum_k c_k f_n^(d - k) f_t^k."""
+    return [k * each for k, each in enumerate(c)][1:]
 
 
 def _horner(coefficients, s: Scalar) -> Scalar:

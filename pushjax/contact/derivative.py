@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from pushjax._math.arrays import combined, dot, products
 from pushjax._math.sums import repeated, summed
-from pushjax.contact.finish import Equations, Solution, System, in_units
+from pushjax.contact.finish import Equations, Solution, in_units
 from pushjax.contact.force_distribution import of_chosen, shared_weights
 from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem
 
@@ -28,12 +28,10 @@ def differentiable_solution(
     twist: Float[Array, "3 *batch"],
 ) -> Solution:
     """The solution whose cone edges and twist (m, m, rad) are known; its values are right to roundoff."""
-    equations = Equations.of(problem, best, solved)
-    fixed, constant = jax.lax.stop_gradient((problem, equations))
-    _, basis, axes = constant.bases()
-    into_edges = jnp.where(constant.used[:, None], summed(basis[:, None] * axes[None], 2), 0.0)  # (edge, axis)
-    moving_axes = summed(repeated(equations.edges, 1, 3) * into_edges[:, :, None], 0)
-    system = System(problem.surface, moving_axes, equations.rows, equations.b, ~constant.used)
+    equations, _, basis = Equations.of(problem, best, solved)
+    fixed, constant, basis = jax.lax.stop_gradient((problem, equations, basis))
+    into_edges = jnp.where(constant.used[:, None], summed(basis[:, None] * constant.axes[None], 2), 0.0)  # (edge, axis)
+    axes = summed(repeated(equations.edges, 1, 3) * into_edges[:, :, None], 0)
     # the wrench of the size at which grad H is the twist
     wrench = combined(constant.edges, best.weight)
     motion, length = fixed.surface.gradient(wrench), jnp.ones_like(fixed.length)
@@ -42,9 +40,9 @@ def differentiable_solution(
     factor = jnp.where(solved & (along > 0) & (squared > 0), along / jnp.where(squared > 0, squared, 1.0), 1.0)
     if problem.surface.degree == 4:
         factor = jnp.cbrt(factor)
-    beta = _implicit(system, jax.lax.stop_gradient(products(axes, wrench) * factor[None]))
+    beta = _implicit(equations._replace(axes=axes), products(constant.axes, wrench) * factor[None])
     placeholder = jnp.zeros_like(beta).at[0].set(1)
-    wrench = jnp.where(solved[None], combined(moving_axes, beta), placeholder)
+    wrench = jnp.where(solved[None], combined(axes, beta), placeholder)
     own = of_chosen(problem.edges, best.edges, summed(into_edges * repeated(beta, 0, 3), 1))
     shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench, dual)
     weights = jnp.where(indeterminate[None], shared, own)
@@ -52,21 +50,21 @@ def differentiable_solution(
 
 
 @eqx.filter_custom_jvp
-def _implicit(system: System, beta: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
-    """The solution `beta` of the system, with its derivatives by the implicit function theorem."""
+def _implicit(equations: Equations, beta: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+    """The solution `beta` of the equations, with its derivatives by the implicit function theorem."""
     return beta
 
 
 @_implicit.def_jvp
 def _implicit_jvp(primals, tangents):
-    system, beta = primals
-    beta = _implicit(system, beta)
+    equations, beta = primals
+    beta = _implicit(equations, beta)
     # Equinox gives None as the tangent of what is not perturbed.
     changes = jax.tree.map(
         lambda d, x: jnp.zeros_like(x) if d is None and eqx.is_inexact_array(x) else d,
         tangents[0],
-        system,
+        equations,
         is_leaf=lambda d: d is None,
     )
-    (hessian, _, _), (_, _, change) = eqx.filter_jvp(lambda s: s.evaluate(beta), (system,), (changes,))
-    return beta, system.newton_step(hessian, change)
+    (hessian, _, _), (_, _, change) = eqx.filter_jvp(lambda e: e.evaluate(beta), (equations,), (changes,))
+    return beta, equations.newton_step(hessian, change)

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from pushjax._math.arrays import combined, cross, dot, dual, products, times
 from pushjax._math.sums import summed
 from pushjax.contact.cubic import Roots
-from pushjax.contact.scaled_problem import NO_EDGE, ScaledProblem, violation_per_weight
+from pushjax.contact.scaled_problem import NO_EDGE, EdgeSet, ScaledProblem, violation_per_weight
 from pushjax.contact.tolerances import (
     kinematic_tolerance,
     min_determinant,
@@ -35,15 +35,18 @@ class Sets(NamedTuple):
     @staticmethod
     def of(edges: Numbers) -> "Sets":
         """Sets of one edge or of two, (1 or 2, sets) or (1 or 2, sets, batch), under their contacts' conditions."""
-        return Sets(*(padded(numbers) for numbers in (edges, own_conditions(edges))))
+        xp = np if isinstance(edges, np.ndarray) else jnp
+        conditions = edges >> 1 << 1
+        if len(edges) == 2:  # of one contact that sticks, both conditions
+            conditions = xp.stack([conditions[0], conditions[1] + (conditions[0] == conditions[1])])
+        unused = xp.full((3 - len(edges), *edges.shape[1:]), NO_EDGE, np.int32)
+        return Sets(xp.concatenate([edges, unused]), xp.concatenate([conditions, unused]))
 
 
 class Solutions(NamedTuple):
     """A solution of each of S sets."""
 
-    edges: Int[Array, "3 sets batch"]  # numbers of the edges, then `NO_EDGE`
-    conditions: Int[Array, "3 sets batch"]  # as in `Sets`
-    weight: Float[Array, "3 sets batch"]  # of each edge in the wrench
+    chosen: EdgeSet  # with an axis for the sets, before the batch
     twist: Float[Array, "3 sets batch"]  # dimensionless
     power: Float[Array, "sets batch"]  # with the wrench on H = 1
     passes: Bool[Array, "sets batch"]  # whether it satisfies every condition
@@ -52,20 +55,7 @@ class Solutions(NamedTuple):
     def of(sets: Sets, weight: Array, twist: Array, power: Array, passes: Array) -> "Solutions":
         """The solutions of sets."""
         edges, conditions = (jnp.broadcast_to(with_batch(x), weight.shape) for x in sets)
-        return Solutions(edges, conditions, weight, twist, power, passes)
-
-
-def own_conditions(edges: Numbers) -> Numbers:
-    """The conditions of the contacts of one edge or two: the normal ones, or of one that sticks both."""
-    xp = np if isinstance(edges, np.ndarray) else jnp
-    normal = edges >> 1 << 1
-    return normal if len(edges) == 1 else xp.stack([normal[0], normal[1] + (normal[0] == normal[1])])
-
-
-def padded(numbers: Numbers) -> Numbers:
-    """Three numbers of each set, the last ones `NO_EDGE`."""
-    xp = np if isinstance(numbers, np.ndarray) else jnp
-    return xp.concatenate([numbers, xp.full((3 - len(numbers), *numbers.shape[1:]), NO_EDGE, np.int32)])
+        return Solutions(EdgeSet(edges, conditions, weight), twist, power, passes)
 
 
 def along(x: Array, index: Array, axis: int) -> Array:

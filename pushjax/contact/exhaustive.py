@@ -71,14 +71,6 @@ class Exhaustive(ContactSolver):
     proves_jams: ClassVar[bool] = True
 
     def search(self, problem: ScaledProblem) -> Found:
-        """Find the cone edges that carry the force.
-
-        Args:
-            problem: Dimensionless contact problems, with an axis for the batch.
-
-        Returns:
-            The best set of cone edges of each problem.
-        """
         found = best_of_sets(problem, *_all_sets(problem.count))
         return _with_opposite_pairs(problem, found) if problem.count > 2 else found
 
@@ -160,8 +152,8 @@ def _best(kinds: list[Solutions]) -> Found:
     difference = solutions.twist - best.twist[:, None]
     far = same_solution_tolerance(dtype) ** 2 * (squared + dot(best.twist, best.twist)[None])
     found = jnp.any(accepted, axis=0)
-    edges, conditions = (jnp.where(found[None], x, NO_EDGE) for x in (best.edges, best.conditions))
-    chosen = EdgeSet(edges, conditions, best.weight)
+    edges, conditions = (jnp.where(found[None], x, NO_EDGE) for x in best.chosen[:2])
+    chosen = EdgeSet(edges, conditions, best.chosen.weight)
     second_found = jnp.any(accepted & (dot(difference, difference) > far), axis=0) & found
     return Found(chosen, second_found, jnp.any(passes & ~slow & too_fast, axis=0))
 

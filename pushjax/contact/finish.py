@@ -29,14 +29,6 @@ from pushjax.friction.polynomial import Polynomial
 NEWTON_ITERATIONS = {4: 3, 8: 4}  # by the bytes of a float; each is kept only if it makes the residual smaller
 
 
-class Decided(NamedTuple):
-    """Whether a set solves the problem, and who may carry force."""
-
-    solved: Bool[Array, "*batch"]  # whether every condition holds
-    admissible: Bool[Array, "edges *batch"]  # whether a cone edge may carry force under the motion
-    mode: Int[Array, "contacts *batch"]  # `ContactMode`
-
-
 class Refined(NamedTuple):
     """The solution of a set's equations, dimensionless."""
 
@@ -49,14 +41,31 @@ class Refined(NamedTuple):
     is_wrench: Bool[Array, "*batch"]  # whether the weights make up the wrench, and it is more than roundoff
 
 
-class System(NamedTuple):
-    """The square system R grad H(Q beta) = b of a set; vectors are (slot, component, batch)."""
+class Equations(NamedTuple):
+    """The square system R grad H(Q beta) = b of a set of cone edges; vectors are (slot, component, batch)."""
 
     surface: Polynomial
+    used: Bool[Array, "3 *batch"]  # whether the slot has an edge
+    edges: Float[Array, "3 3 *batch"]
     axes: Float[Array, "3 3 *batch"]  # Q: orthonormal axes of the first edge, of the plane of two, of space
+    conditioned: Bool[Array, "3 *batch"]  # whether the slot has a condition
     rows: Float[Array, "3 3 *batch"]  # R
     b: Float[Array, "3 *batch"]
-    unused: Bool[Array, "3 *batch"]
+
+    @staticmethod
+    def of(
+        problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]
+    ) -> tuple["Equations", Float[Array, "3 3 *batch"], Float[Array, "3 3 *batch"]]:
+        """The equations of a set, none where not `moves`; and its edges completed to a basis, and the dual basis."""
+        used, conditioned = moves[None] & (chosen.edges >= 0), moves[None] & (chosen.conditions >= 0)
+        rows, goal = problem.numbered_rows()
+        numbered = selected(jnp.concatenate([rows, goal[None]]), jnp.where(conditioned, chosen.conditions, NO_EDGE))
+        edges = selected(problem.edges, jnp.where(used, chosen.edges, NO_EDGE))
+        edges, rows = jnp.moveaxis(edges, 1, 0), jnp.moveaxis(numbered[:3], 1, 0)
+        full, basis = completed(edges, used, 0.01 * float(jnp.finfo(edges.dtype).eps))
+        q1, q3 = unit(full[0]), unit(cross(full[0], full[1]))
+        axes = jnp.where(used[:, None], jnp.stack([q1, cross(q3, q1), q3]), 0.0)
+        return Equations(problem.surface, used, edges, axes, conditioned, rows, numbered[3]), full, basis
 
     def evaluate(self, beta: Array) -> tuple[Array, Array, Array]:
         """The Hessian and grad H at Q beta, and the residual R grad H - b."""
@@ -71,65 +80,37 @@ class System(NamedTuple):
         jacobian = summed(
             repeated(jnp.moveaxis(self.rows, 1, 0), 1, 3) * repeated(moved, 2, 3), 0
         )  # (axis, row, batch)
-        diagonal = jnp.eye(3, dtype=bool).reshape(3, 3, *(1,) * (residual.ndim - 1)) & self.unused[None]
+        diagonal = jnp.eye(3, dtype=bool).reshape(3, 3, *(1,) * (residual.ndim - 1)) & ~self.used[None]
         jacobian = jnp.where(diagonal, 1.0, jacobian)
         sizes = summed(jacobian * jacobian, 1)
         least = jnp.finfo(residual.dtype).eps * 1e-2 * jnp.sqrt(sizes[0] * sizes[1] * sizes[2])
         return products(dual(jacobian, least)[0], -residual)
 
 
-def _root(system: System, beta: Array) -> Array:
+def _root(equations: Equations, beta: Array) -> Array:
     """Solve the system by Newton's method from beta."""
 
     def iterate(_, state):
         beta, (hessian, gradient, residual) = state
-        candidate = beta + system.newton_step(hessian, residual)
-        new = system.evaluate(candidate)
+        candidate = beta + equations.newton_step(hessian, residual)
+        new = equations.evaluate(candidate)
         better = (dot(new[2], new[2]) < dot(residual, residual))[None]
         return jnp.where(better, candidate, beta), tree_where(better, new, (hessian, gradient, residual))
 
-    return jax.lax.fori_loop(0, NEWTON_ITERATIONS[beta.dtype.itemsize], iterate, (beta, system.evaluate(beta)))[0]
-
-
-class Equations(NamedTuple):
-    """The equations of a set of cone edges; vectors are (slot, component, batch)."""
-
-    used: Bool[Array, "3 *batch"]  # whether the slot has an edge
-    edges: Float[Array, "3 3 *batch"]
-    conditioned: Bool[Array, "3 *batch"]  # whether the slot has a condition
-    rows: Float[Array, "3 3 *batch"]
-    b: Float[Array, "3 *batch"]
-
-    @staticmethod
-    def of(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]) -> "Equations":
-        """The equations of a set, none where not `moves`."""
-        used, conditioned = moves[None] & (chosen.edges >= 0), moves[None] & (chosen.conditions >= 0)
-        rows, goal = problem.numbered_rows()
-        numbered = selected(jnp.concatenate([rows, goal[None]]), jnp.where(conditioned, chosen.conditions, NO_EDGE))
-        edges = selected(problem.edges, jnp.where(used, chosen.edges, NO_EDGE))
-        edges, rows = jnp.moveaxis(edges, 1, 0), jnp.moveaxis(numbered[:3], 1, 0)
-        return Equations(used, edges, conditioned, rows, numbered[3])
-
-    def bases(self) -> tuple[Array, Array, Array]:
-        """The edges completed to a basis, its dual basis, and orthonormal axes of one, two and three edges."""
-        full, basis = completed(self.edges, self.used, 0.01 * float(jnp.finfo(self.b.dtype).eps))
-        q1, q3 = unit(full[0]), unit(cross(full[0], full[1]))
-        return full, basis, jnp.where(self.used[:, None], jnp.stack([q1, cross(q3, q1), q3]), 0.0)
+    return jax.lax.fori_loop(0, NEWTON_ITERATIONS[beta.dtype.itemsize], iterate, (beta, equations.evaluate(beta)))[0]
 
 
 def refine(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]) -> Refined:
     """Solve the equations of a set of cone edges; where not `moves`, the numbers are finite but have no meaning."""
-    equations = Equations.of(problem, chosen, moves)
-    used, edges, conditioned, rows, b = equations
-    full_edges, edge_basis, axes = equations.bases()
+    equations, full_edges, edge_basis = Equations.of(problem, chosen, moves)
+    _, used, edges, axes, conditioned, rows, b = equations
     # the rows' residual is roundoff, which nearly dependent rows would magnify
     _, row_basis = completed(rows, conditioned, float(jnp.finfo(b.dtype).eps) ** 0.5)
-    system = System(problem.surface, axes, rows, b, ~used)
-    beta = _root(system, _rescaled(system, products(axes, combined(edges, chosen.weight))))
+    beta = _root(equations, _rescaled(equations, products(axes, combined(edges, chosen.weight))))
     f = combined(axes, beta)
     # With three edges, correct the wrench so that grad H is the motion that the conditions alone fix: nearly dependent
     # rows magnify roundoff, so Newton's method stalls short of it. Corrections that are not small are not made.
-    hessian, gradient, residual = system.evaluate(beta)
+    hessian, gradient, residual = equations.evaluate(beta)
     step = solve(hessian, combined(row_basis, -residual))
     small = used[2] & (dot(step, step) < 1e-8 * dot(f, f))
     f = f + jnp.where(small[None], step, 0.0)
@@ -161,19 +142,21 @@ def completed(vectors: Array, used: Bool[Array, "3 *batch"], relative: float) ->
     return full, dual(full, relative * jnp.sqrt(sizes[0] * sizes[1] * sizes[2]))[0]
 
 
-def _rescaled(system: System, beta: Array) -> Array:
+def _rescaled(equations: Equations, beta: Array) -> Array:
     """Scale beta so that grad H is as long as the conditions require, by least squares."""
-    motion = products(system.rows, system.evaluate(beta)[1])
+    motion = products(equations.rows, equations.evaluate(beta)[1])
     squared = dot(motion, motion)
-    factor = jnp.maximum(dot(motion, system.b) / jnp.where(squared > 0, squared, 1.0), 0)
-    return beta * (factor if system.surface.degree == 2 else jnp.exp(jnp.log(factor) / 3))[None]  # faster than cbrt
+    factor = jnp.maximum(dot(motion, equations.b) / jnp.where(squared > 0, squared, 1.0), 0)
+    return beta * (factor if equations.surface.degree == 2 else jnp.exp(jnp.log(factor) / 3))[None]  # faster than cbrt
 
 
-def check(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"], refined: Refined) -> Decided:
-    """Check every condition of the problem, with somewhat wider tolerances than a search."""
+def check(
+    problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"], refined: Refined
+) -> tuple[Bool[Array, "*batch"], Bool[Array, "edges *batch"], Int[Array, "contacts *batch"]]:
+    """Whether every condition holds, whether each cone edge may carry force under the motion, and the modes."""
     # No contact is violated, the forces are inside their cones and on the side of the slip, the twist is along grad H
     # and not too fast. A search has checked these conditions before the refinement, which changes its numbers by
-    # roundoff only.
+    # roundoff only, so the tolerances are somewhat wider here.
     dtype, twist, weight = refined.twist.dtype, refined.twist, refined.weight
     slip_n, slip_t = problem.slips(twist)
     tolerance = kinematic_tolerance(twist)[None]
@@ -201,7 +184,7 @@ def check(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"],
     # from the motion alone, because modes must not depend on which of several force distributions is returned
     mode = jnp.where(solved[None] & problem.active & (slip_n <= tolerance), mode, ContactMode.SEPARATED)
     admissible = admissible.reshape(2 * problem.count, *twist.shape[1:])
-    return Decided(solved, admissible, mode.astype(jnp.int8))
+    return solved, admissible, mode.astype(jnp.int8)
 
 
 class Solution(NamedTuple):

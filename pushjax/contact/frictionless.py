@@ -35,7 +35,6 @@ class Frictionless(ContactSolver):
     proves_jams: ClassVar[bool] = True
 
     def search(self, problem: ScaledProblem) -> Found:
-        """Find the contacts that carry the force, each as its left edge."""
         return Found.guessed(least_violation(problem).best)
 
 

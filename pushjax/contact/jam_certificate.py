@@ -53,54 +53,21 @@ class Squeeze(NamedTuple):
         )
 
 
-class _Four(NamedTuple):
-    """Four cone edges, or numbers of sets of four."""
-
-    wrench: Float[Array, "3 4 *rest"]
-    power: Float[Array, "4 *rest"]
-    active: Bool[Array, "*rest"]
-    friction: Float[Array, "2 *rest"]  # of the first and the third edge
-    edge_cross: Float[Array, "3 2 *rest"]  # 2 t x n of the contacts of the first and the third edge
-    # Whether the first two, and the last two, are of one contact; and whether the fourth is `across`, the third the
-    # moment.
-    same12: Bool[Array, "*rest"]
-    same34: Bool[Array, "*rest"]
-    has_across: Bool[Array, "*rest"]
-    has_moment: Bool[Array, "*rest"]
-
-
-class _Rows(NamedTuple):
-    """What the sets are made from: every cone edge, then the moment and `across`."""
-
-    wrench: Float[Array, "3 edges *batch"]
-    numbers: Float[Array, "6 edges *batch"]  # power, friction, 2 t x n, and whether the edge's contact takes part
-
-    @staticmethod
-    def of(problem: ScaledProblem) -> "_Rows":
-        """The edges of a problem."""
-        goal, mu = problem.goal, problem.friction
-        power = jnp.stack([goal[0] + mu * goal[1], goal[0] - mu * goal[1]], axis=1).reshape(-1, *mu.shape[1:])
-        numbers = jnp.stack([mu, *(2 * cross(problem.tangent, problem.normal)), problem.active.astype(mu.dtype)])
-        numbers = jnp.concatenate([power[None], jnp.repeat(numbers, 2, axis=1)])
-        dummies = np.zeros((9, 2))
-        dummies[2, 0] = dummies[4] = dummies[8] = 1  # a moment; friction one; active
-        dummies = jnp.asarray(dummies, mu.dtype).reshape(9, 2, *(1,) * (mu.ndim - 1))
-        rows = jnp.concatenate([problem.edges, numbers])
-        rows = jnp.concatenate([rows, jnp.broadcast_to(dummies, (9, 2, *mu.shape[1:]))], axis=1)
-        return _Rows(rows[:3], rows[3:])
-
-    def four(self, values: Float[Array, "9 4 *rest"], kinds: Bool[Array, "4 *rest"]) -> _Four:
-        """Sets of four edges, given the rows of their edges and their kinds (`_kinds`)."""
-        wrench, power, friction, edge_cross, active = values[:3], values[3], values[4], values[5:8], values[8]
-        return _Four(wrench, power, jnp.all(active > 0, axis=0), friction[::2], edge_cross[:, ::2], *kinds)
-
-    def stacked(self) -> Float[Array, "9 edges *batch"]:
-        """All rows in one array."""
-        return jnp.concatenate([self.wrench, self.numbers])
+def _rows(problem: ScaledProblem) -> Float[Array, "9 edges *batch"]:
+    """Every cone edge, then the moment and `across`: wrench, power, friction, 2 t x n, and whether it takes part."""
+    goal, mu = problem.goal, problem.friction
+    power = jnp.stack([goal[0] + mu * goal[1], goal[0] - mu * goal[1]], axis=1).reshape(-1, *mu.shape[1:])
+    numbers = jnp.stack([mu, *(2 * cross(problem.tangent, problem.normal)), problem.active.astype(mu.dtype)])
+    rows = jnp.concatenate([problem.edges, power[None], jnp.repeat(numbers, 2, axis=1)])
+    dummies = np.zeros((9, 2))
+    dummies[2, 0] = dummies[4] = dummies[8] = 1  # a moment; friction one; active
+    dummies = jnp.asarray(dummies, mu.dtype).reshape(9, 2, *(1,) * (mu.ndim - 1))
+    return jnp.concatenate([rows, jnp.broadcast_to(dummies, (9, 2, *mu.shape[1:]))], axis=1)
 
 
 def _kinds(numbers: Any, num_edges: int) -> tuple[Any, Any, Any, Any]:
-    """The last four fields of `_Four` for sets of four edges with these numbers, (4, ...)."""
+    """Of sets of four edges, (4, ...): whether the first two, and the last two, are of one contact; and the dummies."""
+    # whether the fourth is `across`, and whether the third is the moment
     first, second, third, fourth = numbers
     has_across = fourth == num_edges + 1
     return first >> 1 == second >> 1, (third >> 1 == fourth >> 1) & ~has_across, has_across, third == num_edges
@@ -111,18 +78,16 @@ def search_squeeze(problem: ScaledProblem) -> Squeeze:
     start = Squeeze.none(problem.unit)
     if problem.count < 2:
         return start
-    rows, table = _Rows.of(problem), _sets(2 * problem.count)
-    stacked = rows.stacked()
+    rows, table = _rows(problem), _sets(2 * problem.count)
 
     def try_sets(best: Squeeze, sets: tuple[Int[Array, "4 sets"], Bool[Array, "4 sets"]]):
         numbers, kinds = sets
-        values = jnp.take(stacked, numbers.reshape(-1), axis=1, mode="clip").reshape(9, *numbers.shape, -1)
-        found = _equilibrium(rows.four(values, kinds[..., None]))
-        power = jnp.where(found.exists, found.power, -jnp.inf)
-        index = jnp.argmax(power, axis=0)
-        largest = jnp.max(power, axis=0)
+        chosen = jnp.take(rows, numbers.reshape(-1), axis=1, mode="clip").reshape(9, *numbers.shape, -1)
+        power, roundoff, exists = _equilibrium(chosen, kinds[..., None])
+        presses = best.presses | jnp.any(exists & (power > roundoff), axis=0)
+        power = jnp.where(exists, power, -jnp.inf)
+        index, largest = jnp.argmax(power, axis=0), jnp.max(power, axis=0)
         better = largest > best.power
-        presses = best.presses | jnp.any(found.exists & (found.power > found.roundoff), axis=0)
         edges = jnp.where(better[None], jnp.take(numbers, index, axis=1), best.edges)
         return Squeeze(jnp.where(better, largest, best.power), presses, edges), None
 
@@ -134,9 +99,8 @@ def search_squeeze(problem: ScaledProblem) -> Squeeze:
 def squeeze_power(problem: ScaledProblem, edges: Int[Array, "4 *batch"]) -> Float[Array, "*batch"]:
     """The power of the equilibrium of four edges that `search_squeeze` found; differentiable."""
     # Whether it exists is not decided again, because with other roundoff the answer could be no.
-    rows = _Rows.of(problem)
     kinds = jnp.stack(_kinds(edges, 2 * problem.count))
-    return _equilibrium(rows.four(selected(rows.stacked(), edges), kinds)).power
+    return _equilibrium(selected(_rows(problem), edges), kinds)[0]
 
 
 def _sets(num_edges: int) -> np.ndarray:
@@ -155,30 +119,24 @@ def _sets(num_edges: int) -> np.ndarray:
     return table.reshape(-1, at_once, 4).transpose(0, 2, 1)
 
 
-class _Equilibrium(NamedTuple):
-    """The internal equilibrium of four edges: a basic solution of the linear program."""
-
-    power: Float[Array, "*rest"]
-    roundoff: Float[Array, "*rest"]  # of the power
-    exists: Bool[Array, "*rest"]  # whether the four edges have an equilibrium with forces inside the cones
-
-
-def _equilibrium(four: _Four) -> _Equilibrium:
-    """Compute the internal equilibrium of four edges."""
+def _equilibrium(rows: Float[Array, "9 4 *rest"], kinds: Bool[Array, "4 *rest"]) -> tuple[Array, Array, Array]:
+    """Power of the internal equilibrium of four edges, its roundoff, and whether there is one inside the cones."""
     # by Cramer's rule, the weight of each edge is the determinant of the other three, with alternating sign
-    g1, g2, g3, g4 = (four.wrench[:, k] for k in range(4))
-    cross12, mu12, size12 = _pair_cross(four, 0, four.same12)
+    power, friction, edge_cross, active = rows[3], rows[4], rows[5:8], rows[8]
+    same12, same34, has_across, has_moment = kinds
+    g1, g2, g3, g4 = (rows[:3, k] for k in range(4))
+    cross12, mu12, size12 = _pair_cross(g1, g2, edge_cross[:, 0], friction[0], same12)
     orthogonal = _orthogonal_direction(cross12, cross(g2, g3), cross(g3, g1))
-    g4 = jnp.where(four.has_across[None], orthogonal, g4)
-    cross34, mu34, size34 = _pair_cross(four._replace(wrench=jnp.stack([g1, g2, g3, g4], axis=1)), 1, four.same34)
+    g4 = jnp.where(has_across[None], orthogonal, g4)
+    cross34, mu34, size34 = _pair_cross(g3, g4, edge_cross[:, 2], friction[2], same34)
     friction_scale = jax.lax.stop_gradient(1 / jnp.maximum(jnp.maximum(mu12, mu34), jnp.finfo(g1.dtype).tiny))
     mu12, mu34 = mu12 * friction_scale, mu34 * friction_scale
     weights = jnp.stack(
         [mu34 * dot(g2, cross34), -mu34 * dot(g1, cross34), mu12 * dot(g4, cross12), -mu12 * dot(g3, cross12)]
     )
     # The dummy edges carry no force. In an equilibrium their weights are roundoff.
-    no = jnp.zeros_like(four.has_moment)
-    is_dummy = jnp.stack([no, no, four.has_moment, four.has_across])
+    no = jnp.zeros_like(has_moment)
+    is_dummy = jnp.stack([no, no, has_moment, has_across])
     is_dummy = jnp.broadcast_to(is_dummy, weights.shape)
     dummy_weight = summed(jnp.where(is_dummy, jnp.abs(weights), 0.0), 0)
     weights = jnp.where(is_dummy, 0.0, weights)
@@ -188,21 +146,19 @@ def _equilibrium(four: _Four) -> _Equilibrium:
     roundoff = jax.lax.stop_gradient(DETERMINANT_ROUNDOFF * eps * term_size)
     # all weights have one sign up to roundoff, are more than roundoff, and the dummy edges carry nothing
     exists = (
-        four.active
+        jnp.all(active > 0, axis=0)
         & (jnp.abs(total) >= absolute_total * (1 - 64 * eps))
         & (absolute_total > roundoff)
         & (dummy_weight <= tolerance * absolute_total)
     )
     per_total = 1 / jnp.where(total != 0, total, 1.0)
-    power, largest_power = summed(weights * four.power, 0), jnp.max(jnp.abs(four.power), axis=0)
-    return _Equilibrium(per_total * power, jax.lax.stop_gradient(jnp.abs(per_total) * largest_power * roundoff), exists)
+    roundoff = jnp.abs(per_total) * jnp.max(jnp.abs(power), axis=0) * roundoff
+    return per_total * summed(weights * power, 0), jax.lax.stop_gradient(roundoff), exists
 
 
-def _pair_cross(four: _Four, pair: int, same_contact: Bool[Array, "*rest"]) -> tuple[Array, Array, Array]:
-    """Vector, factor and size of terms of the cross product of the first two edges (pair 0) or the last two (1)."""
+def _pair_cross(g: Array, h: Array, edge_cross: Array, friction: Array, same_contact: Array) -> tuple[Array, ...]:
+    """Vector, factor and size of terms of the cross product of two edges, which may be of one contact."""
     # the cross product is the vector times the factor; the size is that of the vector's terms
-    g, h = four.wrench[:, 2 * pair], four.wrench[:, 2 * pair + 1]
-    edge_cross, friction = four.edge_cross[:, pair], four.friction[pair]
     return (
         jnp.where(same_contact[None], edge_cross, cross(g, h)),
         jnp.where(same_contact, friction, 1.0),

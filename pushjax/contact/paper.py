@@ -14,6 +14,7 @@ Reference: Zhou et al. 2017, section IV. Deviations: the damping, the line searc
 `HessianIteration`; the constant term, the solver of the linear problems and the exact solution of the sets found.
 """
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -25,17 +26,11 @@ from pushjax._internal.xla import compute_once
 from pushjax._math.arrays import times
 from pushjax._math.sums import summed
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.contact.contact_plane import LimitCurve
+from pushjax.contact.contact_plane import LimitCurve, by_normal, by_tangential
 from pushjax.contact.edge_sets import Sets
 from pushjax.contact.exhaustive import best_of_sets
 from pushjax.contact.scaled_problem import ContactSolver, Found, ScaledProblem
 from pushjax.contact.sticking import StickingSolver
-
-
-def finest_tolerance(dtype) -> float:
-    """Sine of the angle at which `HessianIteration` stops: 3e-13 in float64, 3e-6 in float32."""
-    # It can be reached even for ill-conditioned limit surfaces.
-    return float(jnp.finfo(dtype).eps) ** 0.8
 
 
 class HessianIteration(StickingSolver):
@@ -52,13 +47,11 @@ class HessianIteration(StickingSolver):
 
     Attributes:
         max_rounds: Largest number of iterations.
-        tolerance: Sine of the angle between motion and push at which the iteration stops; None for `finest_tolerance`.
 
     Reference: Zhou et al. 2017, section IV.A, corollary 1.
     """
 
     max_rounds: int = eqx.field(static=True, default=25)
-    tolerance: float | None = eqx.field(static=True, default=None)
 
     def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Scalar:
         f, _, _ = self.trace(curve, v)
@@ -71,7 +64,8 @@ class HessianIteration(StickingSolver):
         # A friction cone does not limit the force.
         size = jnp.sqrt(v.dot(v))
         direction = v.scale(1 / jnp.where(size > 0, size, 1.0))
-        tolerance = finest_tolerance(size.dtype) if self.tolerance is None else self.tolerance
+        # a sine that can be reached even for ill-conditioned limit surfaces: 3e-13 in float64, 3e-6 in float32
+        tolerance = float(jnp.finfo(size.dtype).eps) ** 0.8
 
         def sine_of_angle(f: Vec2) -> Scalar:
             motion = _gradient(curve, f)
@@ -103,9 +97,9 @@ def hessian_round(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
     Returns:
         The force after it.
     """
-    gradient = _gradient(curve, f)
-    h_nn, h_nt, h_tt = _hessian(curve, f)
-    residual = v - gradient
+    by_n, by_t = by_normal(curve.c), by_tangential(curve.c)
+    h_nn, h_nt, h_tt = (_value(c, f) for c in (by_normal(by_n), by_tangential(by_n), by_tangential(by_t)))
+    residual = v - _gradient(curve, f)
     det = h_nn * h_tt - h_nt * h_nt
     singular = det <= 0
     inverse = jnp.where(singular, 0.0, 1.0 / jnp.where(singular, 1.0, det))
@@ -115,61 +109,27 @@ def hessian_round(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
     # v - grad h is minus the gradient of the convex function h(f) - v . f. The line search tries the step and its
     # halvings down to 1/512, and takes the one where the slope of this function along the step is nearest to zero. It
     # compares slopes because near the solution the differences of the function itself are lost in roundoff.
-    halvings = [0.5**k for k in range(10)]
-    slopes = [jnp.abs((_gradient(curve, f + step.scale(t)) - v).dot(step)) for t in halvings]
-    best, lowest = halvings[0] * jnp.ones_like(det), slopes[0]
-    for t, slope in zip(halvings[1:], slopes[1:], strict=True):
-        best = jnp.where(slope < lowest, t, best)
-        lowest = jnp.minimum(lowest, slope)
-    return _rescaled(curve, v, compute_once(f + step.scale(best), v.x))
+    halvings = jnp.asarray([0.5**k for k in range(10)], det.dtype)
+    slopes = jnp.abs((_gradient(curve, f + step.scale(halvings)) - v).dot(step))
+    return _rescaled(curve, v, compute_once(f + step.scale(halvings[jnp.argmin(slopes)]), v.x))
 
 
 def _rescaled(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
     """The multiple of f at which h(f) - v . f is lowest."""
     d = curve.degree
-    power, h = jnp.maximum(v.dot(f), 0), d * _value(curve, f)
+    power, h = jnp.maximum(v.dot(f), 0), d * _value(curve.c, f)
     return f.scale((power / jnp.where(h > 0, h, 1.0)) ** (1 / (d - 1)))
 
 
-def _powers(f: Vec2, degree: int) -> tuple[list, list]:
-    """Powers 0 to `degree` of each component."""
-    one = jnp.ones_like(f.x)
-    xs, ys = [one], [one]
-    for _ in range(degree):
-        xs.append(xs[-1] * f.x)
-        ys.append(ys[-1] * f.y)
-    return xs, ys
-
-
-def _value(curve: LimitCurve, f: Vec2) -> Scalar:
-    """h(f)."""
-    d = curve.degree
-    xs, ys = _powers(f, d)
-    return sum((c * xs[d - k] * ys[k] for k, c in enumerate(curve.c)), jnp.zeros_like(f.x))
+def _value(c: Sequence[Scalar], f: Vec2) -> Scalar:
+    """The value at f of the form with coefficients c."""
+    d = len(c) - 1
+    return sum((each * f.x ** (d - k) * f.y**k for k, each in enumerate(c)), jnp.zeros_like(f.x))
 
 
 def _gradient(curve: LimitCurve, f: Vec2) -> Vec2:
     """grad h at f."""
-    d = curve.degree
-    xs, ys = _powers(f, d)
-    zero = jnp.zeros_like(f.x)
-    return Vec2(
-        sum(((d - k) * c * xs[d - k - 1] * ys[k] for k, c in enumerate(curve.c) if k < d), zero),
-        sum((k * c * xs[d - k] * ys[k - 1] for k, c in enumerate(curve.c) if k > 0), zero),
-    )
-
-
-def _hessian(curve: LimitCurve, f: Vec2) -> tuple[Scalar, Scalar, Scalar]:
-    """Second derivatives (nn, nt, tt) of h at f."""
-    d = curve.degree
-    xs, ys = _powers(f, d)
-    zero = jnp.zeros_like(f.x)
-    terms = list(enumerate(curve.c))
-    return (
-        sum(((d - k) * (d - k - 1) * c * xs[d - k - 2] * ys[k] for k, c in terms if k < d - 1), zero),
-        sum((k * (d - k) * c * xs[d - k - 1] * ys[k - 1] for k, c in terms if 0 < k < d), zero),
-        sum((k * (k - 1) * c * xs[d - k] * ys[k - 2] for k, c in terms if k > 1), zero),
-    )
+    return Vec2(_value(by_normal(curve.c), f), _value(by_tangential(curve.c), f))
 
 
 class Projected(ContactSolver):
@@ -185,25 +145,10 @@ class Projected(ContactSolver):
     proves_jams: ClassVar[bool] = False
 
     def search(self, problem: ScaledProblem) -> Found:
-        """Find the cone edges that carry the force.
+        return best_of_sets(problem, *_heaviest_sets(problem, self._forces(problem)))
 
-        Args:
-            problem: Dimensionless contact problems, with an axis for the batch.
-
-        Returns:
-            The best set of cone edges of each problem.
-        """
-        return best_of_sets(problem, *_heaviest_sets(problem, self.iterate(problem)))
-
-    def iterate(self, problem: ScaledProblem) -> Float[Array, "2 contacts batch"]:
-        """Compute contact forces (n, t) in the scale in which the twist is grad H, by all rounds.
-
-        Args:
-            problem: Dimensionless contact problems, with an axis for the batch.
-
-        Returns:
-            The forces of all contacts.
-        """
+    def _forces(self, problem: ScaledProblem) -> Float[Array, "2 contacts batch"]:
+        """Contact forces (n, t) in the scale in which the twist is grad H, by all rounds."""
         start = jnp.where(problem.active & (problem.goal[0] > 0), problem.goal[0], 0.0)
 
         def iterate(_, forces: Array) -> Array:
@@ -250,28 +195,13 @@ def _heaviest_sets(problem: ScaledProblem, forces: Array) -> tuple[Sets, Sets, I
     tangential = jnp.where(mu > 0, forces[1] / jnp.where(mu > 0, mu, 1.0), forces[0])
     left, right = jnp.maximum((forces[0] + tangential) / 2, 0), jnp.maximum((forces[0] - tangential) / 2, 0)
     weights = jnp.stack([left, right], axis=1).reshape(-1, *mu.shape[1:])
-    edge1 = _heaviest(weights, ())
-    edge2 = _heaviest(weights, (edge1,))
-    sticking = _heaviest(jnp.minimum(left, right), ())
-    pairs = [
-        jnp.stack([jnp.minimum(edge1, edge2), jnp.maximum(edge1, edge2)]),
-        jnp.stack([2 * sticking, 2 * sticking + 1]),
-    ]
-    triples = []
-    if problem.count > 1:
-        triples.append(jnp.stack([sticking, sticking, _heaviest(left + right, (sticking,))]))
+    heaviest = jax.lax.top_k(weights.T, 2)[1].T
+    sticking = jnp.argmax(jnp.minimum(left, right), axis=0).astype(jnp.int32)
+    pairs = jnp.stack([jnp.sort(heaviest, axis=0), jnp.stack([2 * sticking, 2 * sticking + 1])], axis=1)
+    of_contact, is_sticking = left + right, jnp.arange(problem.count)[:, None] == sticking[None]
+    other = jnp.argmax(jnp.where(is_sticking, -1.0, of_contact), axis=0).astype(jnp.int32)
+    triples = [jnp.stack([sticking, sticking, other])]
     if problem.count > 2:
-        contacts: tuple[Array, ...] = ()
-        for _ in range(3):
-            contacts += (_heaviest(left + right, contacts),)
-        triples.append(jnp.stack(contacts))
-    three = jnp.stack(triples, axis=1) if triples else jnp.zeros((3, 0, *edge1.shape), jnp.int32)
-    return Sets.of(edge1[None, None]), Sets.of(jnp.stack(pairs, axis=1)), three
-
-
-def _heaviest(weights: Float[Array, "n batch"], excluded: tuple[Int[Array, " batch"], ...]) -> Int[Array, " batch"]:
-    """Index of the largest weight, the indices in `excluded` left out."""
-    numbers = jnp.arange(len(weights), dtype=jnp.int32)[:, None]
-    for index in excluded:
-        weights = jnp.where(numbers == index[None], -1.0, weights)
-    return jnp.argmax(weights, axis=0).astype(jnp.int32)
+        triples.append(jax.lax.top_k(of_contact.T, 3)[1].T)
+    three = jnp.stack(triples, axis=1)[:, : problem.count - 1]  # one contact has none
+    return Sets.of(heaviest[:1, None]), Sets.of(pairs), three

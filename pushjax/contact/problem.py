@@ -68,12 +68,10 @@ class Contacts(eqx.Module):
     ):
         dtype = common_dtype(point, normal, displacement, friction, gap)
         self.point = as_float(point, dtype, "point")
+        self.normal = as_float(normal, dtype, "normal")
+        self.displacement = as_float(displacement, dtype, "displacement")
         check_shape("point", self.point, ("contacts", 2))
         num_contacts = self.point.shape[0]
-        self.normal, self.displacement = (
-            as_float(normal, dtype, "normal"),
-            as_float(displacement, dtype, "displacement"),
-        )
         check_shape("normal", self.normal, (num_contacts, 2))
         check_shape("displacement", self.displacement, (num_contacts, 2))
         self.friction = _per_contact("friction", as_float(friction, dtype, "friction"), num_contacts)

@@ -164,16 +164,11 @@ def nondimensionalize(given: ContactArrays) -> ScaledProblem:
 
 def _broadcast(given: ContactArrays) -> ContactArrays:
     """The contacts with all arrays of one batch; the surface may be shared."""
-    batch = jnp.broadcast_shapes(*(array.shape[-(array.ndim - 2) :] if array.ndim > 2 else () for array in given[2:5]))
-    batch = jnp.broadcast_shapes(
-        batch, given.surface.table.shape[3:], given.length.shape, *(array.shape[1:] for array in given[5:])
-    )
-
-    def broadcast(array: Array, axes: int) -> Array:
-        return jnp.broadcast_to(array, (*array.shape[:axes], *batch))
-
-    vectors = (broadcast(array, 2) for array in given[2:5])
-    return ContactArrays(given.surface, broadcast(given.length, 0), *vectors, *(broadcast(a, 1) for a in given[5:]))
+    axes = 0, 2, 2, 2, 1, 1, 1  # of one example
+    shapes = (array.shape[n:] for array, n in zip(given[1:], axes, strict=True))
+    batch = jnp.broadcast_shapes(given.surface.table.shape[3:], *shapes)
+    arrays = (jnp.broadcast_to(array, (*array.shape[:n], *batch)) for array, n in zip(given[1:], axes, strict=True))
+    return ContactArrays(given.surface, *arrays)
 
 
 def _displacement_unit(displacement: Array, depth: Array) -> Array:

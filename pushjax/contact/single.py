@@ -79,7 +79,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     one = jnp.ones_like(s)
     # the wrench up to its scale
     direction = tree_where(valid, contact.wrench(Vec2(one, s), form.length), Vec3(one, 0 * one, 0 * one))
-    omega = factor * form.spin(direction) / (size * form.length)
+    omega = factor * form.gradient(direction).z / (size * form.length)
     normal = contact.normal
     linear = normal.scale(point_motion.x) + normal.perp().scale(point_motion.y) - contact.point.perp().scale(omega)
     h = curve.value(s)

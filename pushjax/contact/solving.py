@@ -1,10 +1,12 @@
 """The answer to a problem of several contacts: a guess or a search for the edges that carry the force, then the finish.
 
-In a rollout, one contact alone is tried first (`single_first`), for every example. Where it does not suffice, the cone
-edges that carried the force in the stage before mostly carry it again: their equations are solved and every condition
-is checked (`finish`). A search follows where they do not solve the problem. In a batch, guess and search are done only
-for the examples that need them (`in_tiles`). Where there are several motions, the one that continues is then the
-answer, although another may have larger power, which `solve_contacts` gives.
+In rollouts mostly one contact does all the work. So the contact that is pressed most is solved first, as if there were
+no other (`single`), for every example. The result is a solution of the whole problem if every other contact separates:
+the other contacts then bear no force, and no condition requires one. Where it does not suffice, the cone edges that
+carried the force in the stage before mostly carry it again: their equations are solved and every condition is checked
+(`finish`). A search follows where they do not solve the problem. In a batch, guess and search are done only for the
+examples that need them (`in_tiles`). Where there are several motions, the one that continues is then the answer,
+although another may have larger power, which `solve_contacts` gives.
 
 Derivatives are those of the solution (`derivative`), whatever found it.
 """
@@ -38,10 +40,15 @@ from pushjax.contact.scaled_problem import (
     ScaledProblem,
     nondimensionalize,
 )
-from pushjax.contact.single_first import solve_most_pressed
+from pushjax.contact.single import SingleSolution, solve_single
 from pushjax.contact.status import ContactMode, Status
+from pushjax.contact.sticking import ScalarRoot
+from pushjax.contact.tolerances import relative_tolerance
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.polynomial import Polynomial
+
+# How far a contact has to separate to be left out, in units of the distance that passes as touching.
+CLEARANCE = 4
 
 
 class Answer(NamedTuple):
@@ -79,7 +86,7 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
     if not isinstance(solver, Continuing) or guess is None:
         return in_tiles(attempt, jnp.ones((), bool), jnp.zeros((), bool), arrays, None)
     contacts = contacts.where(active)
-    suffices, one, is_own = solve_most_pressed(form, contacts)
+    suffices, one, is_own = _most_pressed(form, contacts)
     together = in_tiles(attempt, ~suffices, guess.exists(), arrays, guess)
     # computed once, or each entry of the answer would compute all of it again
     modes = one.mode == ContactMode.STICKING, one.mode == ContactMode.SLIDING_LEFT
@@ -136,6 +143,25 @@ def _arrays(problem: Problem) -> ContactArrays:
     return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), arrays)
 
 
+def _most_pressed(form: Form, contacts: Contact) -> tuple[Bool[Array, ""], SingleSolution, Bool[Array, "contacts"]]:
+    """Whether the most pressed contact alone gives an answer, its motion, and which contact it is."""
+    approach = contacts.approach().x
+    is_main = jnp.arange(approach.size) == jnp.argmax(approach)
+    one = solve_single(
+        form, jax.tree.map(lambda column: jnp.sum(jnp.where(is_main, column, 0.0)), contacts), ScalarRoot()
+    )
+    twist, length, contacts, approach = jax.lax.stop_gradient((one.twist, form.length, contacts, approach))
+    displacement = jnp.abs(contacts.displacement.x) + jnp.abs(contacts.displacement.y)
+    size = jnp.abs(twist.x) + jnp.abs(twist.y) + length * jnp.abs(twist.z)
+    size = jnp.maximum(size, jnp.max(jnp.maximum(displacement, -contacts.gap)))
+    normal_motion = contacts.normal.dot(twist.xy + contacts.point.perp().scale(twist.z))
+    # an answer if it moves the slider away from all other contacts, or if no contact is pressed
+    clear = normal_motion - approach > CLEARANCE * relative_tolerance(approach.dtype) * size
+    answers = jnp.all(clear | is_main) & (one.status == Status.MOVING)
+    suffices = jnp.all(contacts.friction >= 0) & (answers | jnp.all(approach <= 0))
+    return compute_once(suffices, contacts.gap[0]), one, is_main
+
+
 def _edges_of_one(
     is_own: Bool[Array, "contacts"], sticks: Array, slides_left: Array, force: Array, mu: Array
 ) -> EdgeSet:
@@ -166,10 +192,9 @@ def _attempt(
     best, searched = found.best, jnp.arange(size) < again
     moves = best.exists() & problem.pushes
     refined = refine(problem, best, moves)
-    decided = check(problem, best, moves, refined)
-    solved = decided.solved
+    solved, admissible, mode = check(problem, best, moves, refined)
     weights, indeterminate, dual = distribute_force(
-        problem.edges, decided.admissible & solved[None], best.edges, refined.weight, refined.wrench, refined.start
+        problem.edges, admissible & solved[None], best.edges, refined.weight, refined.wrench, refined.start
     )
     # If the search found a set that the check then rejects, this is no proof of a jam. The same holds if the search
     # found a twist that is too fast to be represented.
@@ -183,7 +208,7 @@ def _attempt(
     known = best._replace(weight=refined.weight)
     answer = Answer(
         in_units(problem, solved, refined.twist, refined.wrench, weights),
-        decided.mode,
+        mode,
         status,
         jnp.where(unsolved | margin, -squeeze.power * problem.unit, jnp.inf),
         unique,

@@ -95,15 +95,11 @@ class ScalarRoot(StickingSolver):
     on r is `HessianIteration` expressed in s, iteration for iteration: the division undoes what the rescaling does
     there. Only the safeguards differ. The safeguard here is a bracket, which is bisected where Newton's step fails.
 
-    An ellipsoid needs no search, because its root has a closed form. For a quartic the default of 12 is enough: of
+    An ellipsoid needs no search, because its root has a closed form. For a quartic 12 iterations are enough: of
     53 000 random sticking contacts (`pushjax.testing.problems`: condition of the Hessian up to 1e3, friction up to 3)
     all had converged to 4e-10 after 10 safeguarded iterations alone, and 97 % after 5.
 
-    Attributes:
-        rounds: Largest number of safeguarded iterations for a quartic; None for 12.
     """
-
-    rounds: int | None = eqx.field(static=True, default=None)
 
     def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Scalar:
         # start with the force along v: there motion . v = d h > 0, so motion and push do not oppose each other
@@ -118,8 +114,7 @@ class ScalarRoot(StickingSolver):
         # Newton's method doubles the digits, so it has converged after a step as short as `newton_tolerance`. A
         # bisection is only as exact as its own length, so that has to be as short as `bisection_tolerance`.
         newton_tolerance, bisection_tolerance = eps**0.6 * friction, eps**0.9 * friction
-        unguarded, max_guarded = 4 if eps > 1e-10 else 5, MAX_ITERATIONS if self.rounds is None else self.rounds
-        converged = jnp.zeros_like(forward)
+        unguarded, converged = 4 if eps > 1e-10 else 5, jnp.zeros_like(forward)
         # These iterations have no bracket, and are enough for nearly all contacts. A contact that has not converged
         # then continues with the bracket. In a batch that loop costs nothing if all contacts have converged.
         for _ in range(unguarded):
@@ -144,7 +139,7 @@ class ScalarRoot(StickingSolver):
 
         # a loop, because in an unrolled one the compiler would recompute each bracket from all iterations before it
         start = (s, -friction, friction, ~converged, jnp.zeros_like(s, jnp.int32))
-        return jax.lax.while_loop(lambda state: state[3] & (state[4] < max_guarded), guarded_iteration, start)[0]
+        return jax.lax.while_loop(lambda state: state[3] & (state[4] < MAX_ITERATIONS), guarded_iteration, start)[0]
 
 
 def _newton_step(curve: LimitCurve, v: Vec2, s: Scalar):
