@@ -131,7 +131,7 @@ def parse(name: str, options: list[str]) -> tuple[ModuleType, partial[Any], Comm
 def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Common) -> None:
     """Run an experiment, print its summary, and write its record and page."""
     from pushjax.cli.page import write_page
-    from pushjax.experiments._cell_cache import CellCache
+    from pushjax.experiments._cell_cache import saved_cells_file
     from pushjax.experiments._record import write_json
     from pushjax.experiments._report import as_text
 
@@ -150,7 +150,7 @@ def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Com
     if title != "demo":
         print(f"wrote {write_page(record, report, common.out / f'{title}.html')}")
     print(f"wrote {json}")
-    CellCache.delete(title, common.out)  # what was saved in case of an interruption
+    saved_cells_file(title, common.out).unlink(missing_ok=True)  # of use only after an interruption
 
 
 def _fetch(to: Annotated[Path | None, cli_option("FOLDER")] = None) -> None:

@@ -3,7 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -48,7 +48,7 @@ def parsed(
     """Return `run` with `fixed` and the given options bound, and where to write; wrong options end the process."""
     signature = inspect.signature(run)
     own = [each for each in signature.parameters.values() if each.name not in (*CALLBACKS, "out", *fixed)]
-    own = [each.replace(annotation=DataFolder, default=None) if each.name == "folder" else each for each in own]
+    own = [_as_option(each) for each in own]
     common = inspect.Parameter("common", inspect.Parameter.KEYWORD_ONLY, annotation=output)
 
     def given(common: OutputType, **chosen: Any) -> tuple[partial[Any], OutputType]:
@@ -61,3 +61,12 @@ def parsed(
     home = str(Path.home())  # a shell leaves it in `--out=~/pushes` as it is
     expanded = [re.sub(r"^(--[\w-]+=)?~(?=/|$)", lambda begin: (begin[1] or "") + home, each) for each in arguments]
     return tyro.cli(given, args=expanded, prog=program, description=about, config=(tyro.conf.OmitArgPrefixes,))
+
+
+def _as_option(argument: inspect.Parameter) -> inspect.Parameter:
+    """Return an argument of `run` as tyro is to see it."""
+    if argument.name == "folder":
+        return argument.replace(annotation=DataFolder, default=None)
+    if is_dataclass(argument.annotation):  # its fields stand among the other options, without a heading of their own
+        return argument.replace(annotation=Annotated[argument.annotation, tyro.conf.arg(name="")])
+    return argument

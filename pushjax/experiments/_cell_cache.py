@@ -13,56 +13,39 @@ from typing import Any
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import write_json
 
-Labels = dict[str, str]
+Cell = dict[str, Any]
 
 
-class CellCache:
-    """Cells of a run, saved in a file until `delete` is called."""
-
-    def __init__(self, experiment: str, folder: Path | None, settings: dict[str, Any]):
-        self.path = None if folder is None else _cache_file(experiment, folder)
-        self.settings = settings
-        self.cells: list[dict[str, Any]] = []
-        if self.path is not None and self.path.exists():
-            record = json.loads(self.path.read_text())
-            if record["settings"] != settings:
-                other = record["settings"]
-                raise ValueError(f"{self.path} is of a run with other settings, {other}: remove it, or use those")
-            self.cells = record["cells"]
-
-    def find_or_compute(
-        self,
-        todo: Sequence[tuple[Labels, Callable[[], dict[str, Any]]]],
-        progress: ProgressCallback = no_progress,
-    ) -> list[dict[str, Any]]:
-        """Return the cells of a run in the order of `todo`, and compute and save those that are not known."""
-        cells = []
-        # a known cell has all these labels; `compute` returns the rest of a cell
-        for labels, compute in todo:
-            cell = next((cell for cell in self.cells if labels.items() <= cell.items()), None)
-            if cell is None:
-                begin = time.perf_counter()
-                results = compute()
-                # `run_s` is the time of the computation, s
-                cell = self.add(labels | results | {"run_s": time.perf_counter() - begin})
-            cells.append(cell)
-            progress(len(cells), len(todo))
-        return cells
-
-    def add(self, cell: dict[str, Any]) -> dict[str, Any]:
-        """Append a cell, save all cells, and return the cell that was appended."""
-        self.cells.append(cell)
-        if self.path is not None:
-            partial = self.path.with_suffix(".part")
-            write_json({"settings": self.settings, "cells": self.cells}, partial)
-            partial.replace(self.path)  # atomic, so that an interruption cannot leave a half-written file
-        return cell
-
-    @staticmethod
-    def delete(experiment: str, folder: Path) -> None:
-        """Delete the file of an experiment, if there is one, once the results are on the disk."""
-        _cache_file(experiment, folder).unlink(missing_ok=True)
-
-
-def _cache_file(experiment: str, folder: Path) -> Path:
+def saved_cells_file(experiment: str, folder: Path) -> Path:
+    """Return the file that keeps the cells of an experiment; who writes the results deletes it."""
     return folder / f"{experiment}-cells.json"
+
+
+def find_or_compute(
+    path: Path | None,  # of the file that keeps the cells; None: they are not kept
+    settings: dict[str, Any],
+    todo: Sequence[tuple[dict[str, str], Callable[[], Cell]]],  # labels, and what computes the rest of a cell
+    progress: ProgressCallback = no_progress,
+) -> list[Cell]:
+    """Return the cells of a run in the order of `todo`, and compute and save those that are not known."""
+    known: list[Cell] = []
+    if path is not None and path.exists():
+        record = json.loads(path.read_text())
+        if record["settings"] != settings:
+            raise ValueError(f"{path} is of a run with other settings, {record['settings']}: remove it, or use those")
+        known = record["cells"]
+    cells = []
+    for labels, compute in todo:
+        cell = next((cell for cell in known if labels.items() <= cell.items()), None)
+        if cell is None:
+            begin = time.perf_counter()
+            results = compute()
+            cell = labels | results | {"run_s": time.perf_counter() - begin}
+            known.append(cell)
+            if path is not None:
+                partial = path.with_suffix(".part")
+                write_json({"settings": settings, "cells": known}, partial)
+                partial.replace(path)  # atomic, so that an interruption cannot leave a half-written file
+        cells.append(cell)
+        progress(len(cells), len(todo))
+    return cells

@@ -44,37 +44,25 @@ def _processor() -> str:
 
 
 def write_json(record: dict[str, Any], path: Path) -> None:
-    """Write a record, as `as_plain` converts it, to a JSON file."""
-    # JSON has no NaN and no infinity: null is written for such a number, and a warning names the field
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write a record to a JSON file, and warn of numbers that are not finite."""
     missing: list[str] = []
-    path.write_text(json.dumps(_with_null(as_plain(record), "", missing), indent=2, allow_nan=False) + "\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(as_plain(record, "", missing), indent=2, allow_nan=False) + "\n")
     if missing:
         others = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
         warn(f"{path}: {missing[0]}{others} is not a finite number; it is null there")
 
 
-def _with_null(value: Any, name: str, missing: list[str]) -> Any:
-    """Replace numbers that are not finite by None, and append their names to `missing`."""
-    if isinstance(value, dict):
-        return {key: _with_null(entry, f"{name}.{key}" if name else key, missing) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_with_null(entry, f"{name}[{k}]", missing) for k, entry in enumerate(value)]
-    if isinstance(value, float) and not math.isfinite(value):
-        missing.append(name)
-        return None
-    return value
-
-
-def as_plain(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a record whose arrays are lists, whose NumPy and JAX numbers are Python's, and whose paths are text."""
-    return json.loads(json.dumps(record, default=_to_builtin))
-
-
-def _to_builtin(value: Any) -> Any:
-    """Convert a value that `json` cannot write by itself: an array, a NumPy or JAX number, or a path."""
+def as_plain(value: Any, name: str = "", missing: list[str] | None = None) -> Any:
+    """Return a value as JSON has it; the names of numbers that are not finite, which are None, go to `missing`."""
     if isinstance(value, (np.ndarray, np.generic, jax.Array)):
-        return np.asarray(value).tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"cannot write a {type(value).__name__} to JSON")
+        value = np.asarray(value).tolist()
+    if isinstance(value, dict):
+        return {key: as_plain(entry, f"{name}.{key}" if name else key, missing) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_plain(entry, f"{name}[{k}]", missing) for k, entry in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        if missing is not None:
+            missing.append(name)
+        return None
+    return str(value) if isinstance(value, Path) else value

@@ -1,6 +1,5 @@
 """Sliders of experiments: limit surfaces of supports, and outlines, supports and fixtures from text of options."""
 
-import csv
 import math
 from pathlib import Path
 
@@ -67,21 +66,16 @@ def parse_fixture(text: str, friction: float) -> pj.Wall | pj.Fixture:
 
 
 def _vertices(path: Path, option: str) -> np.ndarray:
-    """Read a file with one vertex x, y (m) per line; a heading, a first row without any number, is allowed."""
+    """Read a file with one vertex x, y (m) per line; a heading, a first line without any number, is allowed."""
     try:
-        rows = [row for row in csv.reader(path.expanduser().read_text("utf-8-sig").splitlines()) if row]
-    except (OSError, UnicodeDecodeError) as error:
+        lines = path.expanduser().read_text("utf-8-sig").splitlines()
+        is_heading = not any(cell.strip(" +-.")[:1].isdigit() for cell in "".join(lines[:1]).split(","))
+        vertices = np.loadtxt(lines[is_heading:], delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
         raise ValueError(f"{option}: {path}: expected {SHAPES}; {error}") from error
-    numbers = []
-    for k, row in enumerate(rows):
-        try:
-            numbers.append([float(cell) for cell in row])
-        except ValueError as error:
-            if k > 0 or any(cell.strip(" +-.")[:1].isdigit() for cell in row):
-                raise ValueError(f"{option}: {path}, line {k + 1}: expected two numbers, x and y; got {row}") from error
-    if any(len(row) != 2 for row in numbers) or len(numbers) < 3:
-        raise ValueError(f"{option}: {path}: expected at least three vertices, two numbers each; got {len(numbers)}")
-    return np.array(numbers)
+    if len(vertices) < 3 or vertices.shape[1] != 2:
+        raise ValueError(f"{option}: {path}: expected at least three vertices, two numbers each")
+    return vertices
 
 
 def parse_numbers(option: str, value: str, text: str, separator: str, count: int, allowed: str) -> list[float]:

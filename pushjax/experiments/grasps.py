@@ -28,6 +28,7 @@ from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved, table, uniform_in_circle
 from pushjax.experiments._slider_options import PAIRS, fitted_surface
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, PURPLE, RED, STYLE
 from pushjax.simulation.slider import overlaps
 
@@ -168,23 +169,17 @@ def _results(grasps: pj.MonteCarlo, outcomes: np.ndarray) -> dict[str, Any]:
 def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     """Return the least pad distances (n,), m, with room for the slider at poses (n, 3) in the jaw's frame."""
     vertices = shape.vertices if isinstance(shape, pj.Polygon) else shape.boundary(OUTLINE_POINTS)
-    outline = np.asarray(vertices, np.float64)
-    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
-    y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
-    top, bottom = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)
+    x, y = np.moveaxis(to_world(poses[:, None], np.asarray(vertices, np.float64)), -1, 0)
+    # heights of the outline between the pads, which are centered at the origin; NaN elsewhere
+    heights = [np.where(np.abs(x) <= pad / 2, y, np.nan)]
     next_x, next_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    # the pads are centered at the origin
     for side in (-pad / 2, pad / 2):  # where the outline crosses the lines through the pads' corners
         crosses = (x - side) * (next_x - side) < 0
-        fraction = np.where(crosses, (side - x) / np.where(crosses, next_x - x, 1.0), 0.0)
-        height = y + fraction * (next_y - y)
-        top = np.maximum(top, np.where(crosses, height, -np.inf).max(axis=1))
-        bottom = np.minimum(bottom, np.where(crosses, height, np.inf).min(axis=1))
-    between_pads = np.abs(x) <= pad / 2
-    top = np.maximum(top, np.where(between_pads, y, -np.inf).max(axis=1))
-    bottom = np.minimum(bottom, np.where(between_pads, y, np.inf).min(axis=1))
-    return np.where(top >= bottom, top - bottom, 0.0)  # zero if the slider is not between the pads
+        fraction = (side - x) / np.where(crosses, next_x - x, 1.0)
+        heights.append(np.where(crosses, y + fraction * (next_y - y), np.nan))
+    each = np.concatenate(heights, axis=1)
+    # zero if the slider is not between the pads
+    return np.nan_to_num(np.fmax.reduce(each, axis=1) - np.fmin.reduce(each, axis=1))
 
 
 def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
@@ -273,11 +268,9 @@ def _figure(
 
 def _histograms(panels, poses: np.ndarray) -> None:
     """Draw histograms of x, y (mm) and theta (degrees) of poses (n, 3)."""
-    for k, (axes, (scale, label)) in enumerate(zip(panels, COORDINATES, strict=True)):
-        values = scale * np.asarray(poses[:, k], np.float64)
+    for axes, values, (scale, label) in zip(panels, np.asarray(poses, np.float64).T, COORDINATES, strict=True):
         if len(values):
-            counts, edges = np.histogram(values, PICTURE_BINS)
-            plot.histogram_panel(axes, {"edges": edges, "counts": counts}, label)
+            plot.histogram_panel(axes, scale * values, label, bins=PICTURE_BINS)
 
 
 def summary(record: dict[str, Any]) -> list[str | Table]:

@@ -5,7 +5,6 @@ goes straight from each point to the next. `push` is the number of the push that
 one, and zero on its way between pushes.
 """
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -165,11 +164,7 @@ def run(
     if plan.status in POSSIBLE and plan.transits:
         free, push = options.speed
         motion = finger_motion(plan.transits, np.asarray(plan.path), free=free, push=push)
-    files = []
-    if out is not None and motion is None:
-        (out / WAY_POINTS_FILE).unlink(missing_ok=True)  # a robot must not follow the plan of an earlier call
-    elif out is not None and motion is not None:
-        files.append(str(_write_way_points(out / WAY_POINTS_FILE, motion)))
+    files = [] if out is None else _write_way_points(out, motion)
     pictures = saved(out, lambda: {"plan.png": _figure(slider, goal, fixtures, plan, options)})
     settings = {"seed": seed} | vars(options)
     return result_record("plan", settings, **_plan_entries(plan, goal, motion), files=files, pictures=pictures)
@@ -212,15 +207,16 @@ def _plan_entries(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> di
     }
 
 
-def _write_way_points(path: Path, motion: FingerMotion) -> Path:
-    """Write the motion of the finger, rounded to micrometers and milliseconds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(("time", "push", "finger_x", "finger_y"))
-        for time, push, (x, y) in zip(motion.time, motion.push, motion.position, strict=True):
-            rows.writerow((f"{time:.3f}", int(push), f"{x:.6f}", f"{y:.6f}"))
-    return path
+def _write_way_points(out: Path, motion: FingerMotion | None) -> list[str]:
+    """Write the motion of the finger, if there is one, rounded to micrometers and milliseconds; return the files."""
+    path = out / WAY_POINTS_FILE
+    if motion is None:
+        path.unlink(missing_ok=True)  # a robot must not follow the plan of an earlier call
+        return []
+    out.mkdir(parents=True, exist_ok=True)
+    rows, form = np.column_stack([motion.time, motion.push, motion.position]), ("%.3f", "%d", "%.6f", "%.6f")
+    np.savetxt(path, rows, form, ",", "\r\n", header="time,push,finger_x,finger_y", comments="")
+    return [str(path)]
 
 
 def _figure(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, options: Options) -> Figure:

@@ -9,14 +9,13 @@ import os
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from scipy.stats import binomtest
 
-from pushjax._internal.checks import check_count
+from pushjax._internal.checks import check_count, check_finite, check_non_negative
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, table
@@ -51,7 +50,6 @@ class Episode:
 
 def run(
     seed: int = 0,
-    out: Path | None = None,
     episodes: int = 50,
     lookahead: bool = True,
     cost_to_go: bool = True,
@@ -65,7 +63,6 @@ def run(
 
     Args:
         seed: Seed of the first episode; the others follow.
-        out: Not used, because the experiment draws nothing.
         episodes: Number of episodes.
         lookahead: Whether plans of two pushes are considered.
         cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
@@ -83,10 +80,11 @@ def run(
         ValueError: If `gym-pusht` is not installed, or a number is out of its range.
     """
     check_count("episodes", episodes)
-    given = {"friction_in_model": friction_in_model, "actuation_noise": actuation_noise}
-    for name, value in (given | {"observation_noise": observation_noise}).items():
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must not be negative; got {value!r}")
+    noise = {"actuation_noise": actuation_noise, "observation_noise": observation_noise}
+    given = {"friction_in_model": friction_in_model} | noise
+    for name, value in given.items():
+        check_finite(name, value)
+        check_non_negative(name, value)
     plant = make_plant()
     began = time.perf_counter()
     controller = pusht_controller(
@@ -97,14 +95,13 @@ def run(
         noise=observation_noise * PIXEL,
     )
     setup = time.perf_counter() - began
-    noise = {"actuation_noise": actuation_noise, "observation_noise": observation_noise}
     played = []
     for k in range(episodes):
         played.append(play(plant, controller, seed + k, **noise))
         progress(k + 1, episodes)
     switches = {"lookahead": lookahead, "cost_to_go": cost_to_go, "feedback": feedback}
-    settings: dict[str, Any] = {"seed": seed, "episodes": episodes} | switches | given | noise
-    settings["speeds"] = controller.planner.speeds._asdict()
+    settings = {"seed": seed, "episodes": episodes} | switches | given
+    settings |= {"speeds": controller.planner.speeds._asdict()}
     rows = [{name: value for name, value in asdict(each).items() if "seconds" not in name} for each in played]
     return result_record("pusht-mpc", settings, **_figures(played), setup_seconds=setup, published=PUBLISHED, rows=rows)
 
@@ -121,12 +118,7 @@ def make_plant() -> Any:
 
 
 def play(
-    plant: Any,
-    controller: PushController,
-    seed: int,
-    *,
-    actuation_noise: float = 0.0,
-    observation_noise: float = 0.0,
+    plant: Any, controller: PushController, seed: int, *, actuation_noise: float = 0.0, observation_noise: float = 0.0
 ) -> Episode:
     """Play one episode; noise is in px, and on the observed angle px over the surface's length."""
     rng = np.random.default_rng([seed, 1])

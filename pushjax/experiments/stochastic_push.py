@@ -94,6 +94,7 @@ def run(
     first_run = pj.monte_carlo(*arguments, **options, progress=progress)  # includes compiling
     pushes = pj.monte_carlo(*arguments, **options)
     delta = np.asarray(pushes.delta, np.float64)
+    described = {name: _describe_coordinate(delta[:, k]) for k, name in enumerate(COORDINATES)}
 
     def figures() -> dict[str, Figure]:
         # with the same key, fewer pushes are the first ones
@@ -101,7 +102,7 @@ def run(
         drawn: Any = pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **shown)
         title = f"{n} pushes" + ("" if all_plotted else f", {MAX_PLOTTED} drawn")
         cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), drawn.trajectory, title)
-        return {"stochastic_push.png": cloud, "stochastic_push_histograms.png": _histograms(pushes)}
+        return {"stochastic_push.png": cloud, "stochastic_push_histograms.png": _histograms(described)}
 
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
     settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": SUPPORT_POINTS, "pairs": PAIRS}
@@ -109,7 +110,7 @@ def run(
         "stochastic-push",
         settings,
         n=n,
-        delta={name: _describe_coordinate(delta[:, k]) for k, name in enumerate(COORDINATES)},
+        delta=described,
         correlation=np.corrcoef(delta.T),
         nonconvex=int(np.sum(~(_curvatures(key, model, slider.surface, n) >= MIN_CURVATURE))),
         repaired=float(np.mean(pushes.shrinkage > 0)),
@@ -145,17 +146,17 @@ def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -
     return np.concatenate(curvatures)
 
 
-def _histograms(pushes: pj.MonteCarlo) -> Figure:
+def _histograms(delta: dict[str, dict[str, Any]]) -> Figure:
     """Draw the histogram of each coordinate of the displacement, with the Gaussian of the same moments."""
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
-        for k, (axes, name) in enumerate(zip(panels, COORDINATES, strict=True)):
-            scale, label = LABELS[name]
-            values = scale * np.asarray(pushes.delta[:, k], np.float64)
-            gaussian = values.mean(), values.std(ddof=1)
-            plot.histogram_panel(axes, pushes.histogram(values, HISTOGRAM_BINS), label, gaussian=gaussian)
-            p = scipy.stats.normaltest(values).pvalue
-            axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f} {label.split(' / ')[1]}; normal: p = {p:.1g}")
+        for axes, (name, (scale, label)) in zip(panels, LABELS.items(), strict=True):
+            found = delta[name]
+            counted = {"edges": scale * found["edges"], "counts": found["counts"]}
+            mean, deviation = scale * found["mean"], scale * found["std"]
+            plot.histogram_panel(axes, counted, label, gaussian=(mean, deviation))
+            unit, p = label.split(" / ")[1], found["normality"]["p_value"]
+            axes.set_title(f"{mean:.2f} ± {deviation:.2f} {unit}; normal: p = {p:.1g}")
         panels[0].legend()
         return figure
 

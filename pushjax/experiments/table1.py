@@ -24,7 +24,7 @@ import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets import Recordings
 from pushjax.experiments import tables
-from pushjax.experiments._cell_cache import CellCache
+from pushjax.experiments._cell_cache import find_or_compute, saved_cells_file
 from pushjax.experiments._mit_pushes import group, load, noise_floor_mm, outline, training_pushes
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved
@@ -113,7 +113,7 @@ def run(
             for name in method:
                 labels = {"surface": log.surface, "object": log.object, "model": model, "method": name}
                 todo.append((labels, partial(_cell, log, model, METHODS[name], condition, seed)))
-    cells = CellCache("table1", out, settings).find_or_compute(todo, progress)
+    cells = find_or_compute(None if out is None else saved_cells_file("table1", out), settings, todo, progress)
     settings |= {"method": list(method), "surfaces": list(surface), "objects": list(object)}
     title = "Straight pushes: final pose, predicted against measured"
     return result_record(

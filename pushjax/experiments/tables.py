@@ -13,7 +13,7 @@ import pushjax as pj
 from pushjax.datasets import Recordings
 from pushjax.experiments._report import Table, table
 from pushjax.experiments._slider_options import MODELS, fitted_surface
-from pushjax.geometry.se2 import compose, inverse
+from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.plot.style import BLUE, ORANGE, STYLE
 
 SUPPORT_POINTS = 150  # that stand for uniform pressure
@@ -106,7 +106,7 @@ def no_motion_mm(log: Recordings) -> np.ndarray:
 
 def relative_motions(log: Recordings) -> np.ndarray:
     """Return the end poses (n, 3) in the frames of the starts, in which repetitions are the same push."""
-    return np.asarray(compose(inverse(log.start), log.end), float)
+    return compose(inverse(log.start), log.end)
 
 
 def repetitions(action: np.ndarray) -> np.ndarray:

@@ -30,12 +30,13 @@ import pushjax as pj
 from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets import LogError, Recordings, load_recordings, load_two_finger_logs
-from pushjax.datasets.planar import rotation, wrap_angle
+from pushjax.datasets.planar import wrap_angle
 from pushjax.datasets.recordings import Floats
 from pushjax.experiments import tables
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, distribution_panel, pushes_by_error, saved, table
 from pushjax.experiments._slider_options import MODELS, PAIRS
+from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.plot.style import STYLE, panel_row
 
 OBJECTS = ("3pts1", "3pts3", "patch")
@@ -182,16 +183,10 @@ def stick_deviation(log: Recordings, end: np.ndarray) -> Floats:
     """Return the motions (n,) of the object relative to the hand, m, if the object ends at the poses (n, 3)."""
     assert log.length is not None
     hands = np.array([push.hand[[0, -1], :3] for push in log.pushes]).swapaxes(0, 1)
-    before, after = (_in_hand_frame(*poses) for poses in zip(hands, (log.start, end), strict=True))
+    before, after = (compose(inverse(hand), pose) for hand, pose in zip(hands, (log.start, end), strict=True))
     # zero if both moved as one body; closing an initial gap between hand and object counts as relative motion too
     change = after - before
     return np.hypot(change[:, 0], change[:, 1]) + log.length * np.abs(wrap_angle(change[:, 2]))
-
-
-def _in_hand_frame(hand: np.ndarray, pose: np.ndarray) -> Floats:
-    """Return the poses (n, 3) of the object in the frame of the hand."""
-    offset = np.einsum("nji,nj->ni", rotation(hand[:, 2]), pose[:, :2] - hand[:, :2])
-    return np.column_stack([offset, pose[:, 2] - hand[:, 2]])
 
 
 def _figures(shown: dict[str, tuple[Recordings, OnGrid, np.ndarray, np.ndarray]]) -> dict[str, Figure]:

@@ -239,6 +239,7 @@ def test_help_reads_well(command, capsys):
     printed = capsys.readouterr().out
     assert "{None}" not in printed  # the help shows the values of an option, not how its type is written
     assert "default: None" not in printed
+    assert "options options" not in printed
 
 
 def test_import_changes_nothing_global():

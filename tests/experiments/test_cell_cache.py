@@ -7,7 +7,7 @@ import pytest
 
 from pushjax.cli.main import main as pushjax
 from pushjax.experiments import table1
-from pushjax.experiments._cell_cache import CellCache
+from pushjax.experiments._cell_cache import find_or_compute, saved_cells_file
 
 
 @pytest.mark.parametrize("is_written", [True, False])
@@ -17,7 +17,7 @@ def test_cells_are_deleted_after_the_results_are_written(is_written, tmp_path, m
 
     @functools.wraps(table1.run)
     def run(*given, out=tmp_path, **options):
-        CellCache(name, tmp_path, {}).add({"figure": 1.0})
+        find_or_compute(saved_cells_file(name, tmp_path), {}, [({"figure": "one"}, dict)])
         return {"experiment": name, "figure": 1.0} | about
 
     monkeypatch.setattr(table1, "run", run)

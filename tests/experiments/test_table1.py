@@ -12,7 +12,6 @@ from pushjax.cli import main as cli
 from pushjax.datasets import LogError, Recording, Recordings
 from pushjax.experiments import _mit_pushes as groups
 from pushjax.experiments import table1
-from pushjax.experiments._cell_cache import CellCache
 from pushjax.experiments._mit_pushes import group, noise_floor_mm, outline
 from pushjax.experiments.tables import Prediction, deviation_mm, padded
 
@@ -200,8 +199,6 @@ def test_an_interrupted_run_goes_on(logs, converted, monkeypatch, tmp_path):
     assert len(calls) == 3
     assert [cell["model"] for cell in record["cells"]] == ["quartic", "ellipsoid"]
     assert [path.name for path in tmp_path.iterdir()] == ["table1-cells.json"]  # until the results are written
-    CellCache.delete("table1", tmp_path)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
