@@ -1,7 +1,6 @@
 """Convexity, mean and repairs of a million random surfaces of each sampler.
 
-Convexity is checked in float64 by a sweep of the Hessian that does not use the sampler's certificate. For a few
-surfaces a semidefinite program also searches for a Gram matrix that proves it (needs cvxpy).
+Convexity is checked in float64 by a sweep of the Hessian that does not use the sampler's certificate.
 """
 
 import time
@@ -12,7 +11,6 @@ import jax
 import numpy as np
 
 import pushjax as pj
-from benchmarks.peers import fits
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
 from pushjax.friction.quartic import MONOMIALS
@@ -44,67 +42,38 @@ def draw(model: pj.FrictionModel, surface: pj.LimitSurface, n: int):
     return *(np.concatenate(part) for part in zip(*parts, strict=True)), seconds
 
 
-def certified(coefficients: np.ndarray) -> int:
-    """Count the quartics (n, 15) that a semidefinite program proves to be convex."""
-    # The proof is a Gram matrix of z' hess H(F) z that is positive semidefinite to 1e-6.
-    cp, rng, found = fits.cvxpy(), np.random.default_rng(0), 0
-    f, z = rng.normal(size=(2, 120, 3))
-    y = np.einsum("ni,nj->nij", z, f).reshape(120, 9)
-    q, slack = cp.Variable((9, 9), symmetric=True), cp.Variable()
-    value = cp.Parameter(120)
-    forms = cp.hstack([cp.sum(cp.multiply(np.outer(row, row), q)) for row in y])
-    problem = cp.Problem(cp.Maximize(slack), [forms == value, q >> slack * np.eye(9)])
-    for c in coefficients:
-        c = c / np.abs(c).max()
-        value.value = np.array([_bent(c, a, b) for a, b in zip(f, z, strict=True)])
-        problem.solve(solver=cp.CLARABEL)
-        found += slack.value is not None and float(slack.value) > -1e-6
-    return found
-
-
-def _bent(c: np.ndarray, f: np.ndarray, z: np.ndarray) -> float:
-    """Return z' hess H(F) z as the second derivative of the polynomial H(F + t z), which is exact."""
-    t = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-    values = np.prod((f + t[:, None] * z)[:, None] ** MONOMIALS, axis=2) @ c
-    return float(2 * np.polyfit(t, values, 4)[2])
-
-
 def run(
     n: int = 1_000_000,
-    certificates: int = 200,
     x64: bool = False,
     progress: ProgressCallback = no_progress,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
-    """Draw random surfaces around the quartic of a square on 64 points, and around an ellipsoid.
+    """Draw random surfaces around the quartic of a square on 64 points.
 
     Args:
         n: Number of samples with 20 degrees of freedom; a tenth of it, but at least CHUNK, with others.
-        certificates: Number of quartics with 20 degrees of freedom for which a semi-definite program is solved.
         x64: Whether to compute in float64.
         progress: Called with the number of rows done and their total.
         keep: Called with the record so far.
 
     Returns:
-        The record, with the row of `_quartics` for each sampler and number of degrees of freedom, and `ellipsoid`.
+        The record, with the row of `_quartics` for each sampler and number of degrees of freedom.
     """
     jax.config.update("jax_enable_x64", x64)
     block = pj.Polygon.rectangle(0.09, 0.09)
     surface = pj.fit_limit_surface(*pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 400))
     assert isinstance(surface, pj.Quartic)
     rows: list[dict[str, Any]] = []
-    settings = {"n": n, "certificates": certificates, "dtype": str(surface.coefficients.dtype)}
-    record = result_record("friction", settings, rows=rows, ellipsoid=_ellipsoids(n))
+    record = result_record("friction", {"n": n, "dtype": str(surface.coefficients.dtype)}, rows=rows)
     todo = [(sampler, dof) for sampler in SAMPLERS for dof in DOFS]
     for sampler, dof in todo:
-        count = n if dof == 20 else max(n // 10, CHUNK)
-        rows.append(_quartics(surface, sampler, dof, count, certificates if dof == 20 else 0))
+        rows.append(_quartics(surface, sampler, dof, n if dof == 20 else max(n // 10, CHUNK)))
         keep(record)
         progress(len(rows), len(todo))
     return record
 
 
-def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certificates: int) -> dict[str, Any]:
+def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int) -> dict[str, Any]:
     """Draw `count` quartics around `surface`; return the row with their convexity and moments."""
     mean = np.asarray(surface.coefficients, np.float64)
     c, pull, seconds = draw(pj.FrictionModel(dof=dof, friction=0.3, sampler=sampler), surface, count)
@@ -116,7 +85,6 @@ def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certifica
     begun = time.perf_counter()
     curvature = least_curvatures(c)
     swept = time.perf_counter() - begun
-    few = np.concatenate([c[pull > 0][: certificates // 2], c[pull == 0]])[:certificates]  # half of them repaired
     return {
         "sampler": sampler,
         "dof": dof,
@@ -131,20 +99,7 @@ def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certifica
         "mean_shift": np.abs(shift).max(),  # after repairs, relative to the largest coefficient
         # relative variance of H, in units of 2 / dof
         "variance": np.mean(values.var(axis=0) / values.mean(axis=0) ** 2) * dof / 2,
-        "certified": [certified(few), len(few)] if certificates else None,
     }
-
-
-def _ellipsoids(n: int) -> dict[str, float]:
-    """Draw `n` ellipsoids with 20 degrees of freedom, and compare their moments with the formula's."""
-    a = np.array([[1.0, 0.2, -0.1], [0.2, 1.5, 0.3], [-0.1, 0.3, 0.8]])
-    around = pj.FrictionModel(dof=20.0, friction=0.3).around(pj.Ellipsoid(a, 0.03))
-    ellipsoids: Any = jax.jit(jax.vmap(around.sample))(jax.random.split(jax.random.key(2), n)).surface
-    drawn_a = np.asarray(ellipsoids.A, np.float64)
-    variance = (a**2 + np.outer(np.diag(a), np.diag(a))) / 20
-    off = np.abs(drawn_a.mean(axis=0) - a) / np.sqrt(variance / n)
-    ratio = drawn_a.var(axis=0) / variance
-    return {"mean_off": off.max(), "lowest_variance": ratio.min(), "highest_variance": ratio.max()}
 
 
 def summary(record: dict[str, Any]) -> str:
@@ -158,11 +113,4 @@ def summary(record: dict[str, Any]) -> str:
             f"{row['mean_off']:.1f} standard errors at worst before repair, {row['mean_shift']:.2e} of the largest "
             f"coefficient after; relative variance of H {row['variance']:.3f} of 2 / dof"
         )
-        if row["certified"]:
-            lines.append("       a semi-definite program certifies {} of {}".format(*row["certified"]))
-    here = record["ellipsoid"]
-    lines.append(
-        f"ellipsoid dof 20: mean off {here['mean_off']:.1f} standard errors at worst, variances "
-        f"{here['lowest_variance']:.4f} to {here['highest_variance']:.4f} of the formula's"
-    )
     return "\n".join(lines)

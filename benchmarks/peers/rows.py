@@ -134,16 +134,8 @@ def _mujoco(name: str) -> dict[str, Any]:
     table = mujoco.accuracy(scene, settings)
     at = mujoco.largest(table, 1e-3 * reference_push.ALLOWED_MM)
     found, each = _repeated(lambda: mujoco.timed(scene, settings, at.timestep, TIMED), TIMED)
-    return each | {
-        "of": "push_quartic",
-        "peer": "mujoco",
-        "supports": name,
-        "timestep_s": at.timestep,
-        "error_mm": at.error_mm,
-        "exact_error_mm": _exact_error_mm(name, found.pose),
-        "slip_um": _um(mujoco.push(scene, settings, at.timestep, *_straight(scene, STICKS)).slip),
-        "by_timestep": [row._asdict() for row in table],
-    }
+    slip = mujoco.push(scene, settings, at.timestep, *_straight(scene, STICKS)).slip
+    return each | _row("mujoco", name, at, table, found.pose, slip)
 
 
 def _mjx(name: str) -> dict[str, Any]:
@@ -153,25 +145,31 @@ def _mjx(name: str) -> dict[str, Any]:
     table = mjx.accuracy(batch)
     at = mujoco.largest(table, 1e-3 * reference_push.ALLOWED_MM)
     found, each = _repeated(lambda: batch.pushed(at.timestep, mjx.softened(at.timestep)), BATCH)
-    return each | {
+    slip = found.slip[[mujoco.PUSHES.index((offset, 0.0)) for offset in STICKS]]
+    each |= {"compile_s": batch.compile_seconds, "batch": BATCH, "dtype": "float64"}
+    return each | _row("mjx", name, at, table, found.pose, slip)
+
+
+def _row(
+    peer: str,
+    supports: str,
+    at: mujoco.StepError,  # of the timestep that is used
+    table: list[mujoco.StepError],
+    pose: np.ndarray,  # final poses of `mujoco.fan`, maybe repeated, (n, 3)
+    slip: np.ndarray,  # where the tip sticks, m
+) -> dict[str, Any]:
+    """Return the row of a simulator, with its error against exact Coulomb friction."""
+    exact = _exact(supports)
+    return {
         "of": "push_quartic",
-        "peer": "mjx",
-        "supports": name,
+        "peer": peer,
+        "supports": supports,
         "timestep_s": at.timestep,
         "error_mm": at.error_mm,
-        "exact_error_mm": _exact_error_mm(name, found.pose),
-        "compile_s": batch.compile_seconds,
-        "batch": BATCH,
-        "dtype": "float64",
-        "slip_um": _um(found.slip[[mujoco.PUSHES.index((offset, 0.0)) for offset in STICKS]]),
+        "exact_error_mm": float(reference_push.error_mm(pose[: len(exact)], exact).max()),
+        "slip_um": _um(slip),
         "by_timestep": [row._asdict() for row in table],
     }
-
-
-def _exact_error_mm(name: str, pose: np.ndarray) -> float:
-    """Return the largest error (mm) of the final poses of `mujoco.fan`, (n, 3), against exact Coulomb friction."""
-    exact = _exact(name)  # once for each push of the fan, which `pose` repeats
-    return float(reference_push.error_mm(pose[: len(exact)], exact).max())
 
 
 @cache
