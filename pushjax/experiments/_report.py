@@ -87,7 +87,7 @@ def distribution_panel(axes: Axes, predicted: np.ndarray, no_motion: np.ndarray)
     axes.ecdf(predicted, color=BLUE, label="predicted")
     axes.ecdf(no_motion, ls="--", color=GRAY, label="no motion")
     axes.set(xscale="log", ylim=(0, 1), xlabel="deviation of the final pose / mm", ylabel="share of pushes below")
-    axes.legend(loc="lower right")
+    axes.legend(loc="upper left")
 
 
 def uniform_in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:

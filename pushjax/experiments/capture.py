@@ -12,6 +12,7 @@ Reference: Zhou et al. 2017, section VI.B, figure on two point fingers pushing a
 """
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the picture and the record'
 CONVERGED_DISTANCE = 1e-3  # m
 SUPPORT_POINTS = 150
 GRID_POINTS = 80  # on each axis, for the density of start centers in the picture
+SETUP = {"disk_m": DISK_RADIUS, "finger_m": FINGER_RADIUS, "apart_m": FINGER_SPACING, "travel_m": TRAVEL}
+SETUP |= {"circle_m": START_RADIUS, "ahead_m": START_DISTANCE, "near_m": CONVERGED_DISTANCE}
 
 
 def run(
@@ -79,48 +82,37 @@ def run(
     path = pj.line((0, 0, np.pi / 2, FINGER_SPACING), (0, TRAVEL, np.pi / 2, FINGER_SPACING), steps)
     starts = start_poses(n, seed)
     rows, shown = [], {}
-    for mu in friction:
-        verdicts = []
-        for surface_dof in dof:
-            model = pj.FrictionModel(dof=surface_dof, friction=mu)
-            # run twice with different samples, to find how many verdicts the sampling alone changes
-            keys = (jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + again) for again in range(2))
-            pushes, others = (
-                pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True) for key in keys
-            )
-            verdicts.append(converged(pushes))
-            share = float(verdicts[-1].mean())
-            rows.append(
-                {
-                    "friction": mu,
-                    "dof": surface_dof,
-                    "converged": share,
-                    "outcomes": pushes.outcomes(),
-                    "changed_by_draw_percent": 100 * float(np.mean(verdicts[-1] != converged(others))),
-                    "seconds": pushes.seconds,
-                    "settled": np.flatnonzero(verdicts[-1]),
-                }
-            )
-            if mu == friction[0]:
-                shown[f"dof {surface_dof:g}: {share:.1%} of {n} converge"] = pushes.trajectory, verdicts[-1]
-            progress(len(rows), len(friction) * len(dof))
-        for row in rows[-2:]:
-            row["difference_percent"] = 100 * abs(float(verdicts[0].mean() - verdicts[1].mean()))
-            row["changed_by_noise_percent"] = 100 * float(np.mean(verdicts[0] != verdicts[1]))
-    pictures = saved(out, lambda: {"capture.png": capture_figure(disk, hand, np.asarray(path), shown)})
-    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction}
-    settings |= {"disk_m": DISK_RADIUS, "finger_m": FINGER_RADIUS, "apart_m": FINGER_SPACING, "travel_m": TRAVEL}
-    settings |= {"circle_m": START_RADIUS, "ahead_m": START_DISTANCE, "near_m": CONVERGED_DISTANCE}
+    for k, (mu, surface_dof) in enumerate(product(friction, dof)):
+        setup = {"pose": starts, "model": pj.FrictionModel(dof=surface_dof, friction=mu), "trajectories": True}
+        # run twice with different samples, to find how many verdicts the sampling alone changes
+        keys = (jax.random.fold_in(jax.random.key(seed), 2 * k + again) for again in range(2))
+        pushes, others = (pj.monte_carlo(key, n, slider, hand, path, **setup) for key in keys)
+        verdicts = converged(pushes)
+        row = {"friction": mu, "dof": surface_dof, "converged": float(verdicts.mean()), "outcomes": pushes.outcomes()}
+        row |= {"changed_by_draw_percent": 100 * float(np.mean(verdicts != converged(others)))}
+        rows.append(row | {"seconds": pushes.seconds, "settled": np.flatnonzero(verdicts)})
+        if mu == friction[0]:
+            shown[f"dof {surface_dof:g}: {verdicts.mean():.1%} of {n} converge"] = pushes.trajectory, verdicts
+        progress(len(rows), len(friction) * len(dof))
+    for pair in zip(rows[::2], rows[1::2], strict=True):  # the two dof of one friction
+        _compare(*pair, n)
     return result_record(
         "capture",
-        settings,
+        {"seed": seed, "steps": steps, "dof": dof, "friction": friction} | SETUP,
         n=n,
         dof={f"{row['dof']:g}": {"converged": row["converged"]} for row in rows[:2]},
         difference_percent=rows[0]["difference_percent"],
         starts=starts[:, :2],
         rows=rows,
-        pictures=pictures,
+        pictures=saved(out, lambda: {"capture.png": capture_figure(disk, hand, np.asarray(path), shown)}),
     )
+
+
+def _compare(first: dict[str, Any], second: dict[str, Any], n: int) -> None:
+    """Add to two rows how their shares of convergent pushes and their verdicts on `n` starts differ."""
+    for row in (first, second):
+        row["difference_percent"] = 100 * abs(first["converged"] - second["converged"])
+        row["changed_by_noise_percent"] = 100 * (len(np.setxor1d(first["settled"], second["settled"])) / n)
 
 
 def start_poses(n: int, seed: int) -> np.ndarray:

@@ -28,6 +28,7 @@ from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved, table, uniform_in_circle
 from pushjax.experiments._slider_options import PAIRS, fitted_surface
+from pushjax.experiments.tables import check_chosen
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, PURPLE, RED, STYLE
 from pushjax.simulation.slider import overlaps
@@ -108,13 +109,10 @@ def run(
     Raises:
         ValueError: If the slider is unknown.
     """
-    if slider not in SLIDERS:
-        raise ValueError(f"slider must be one of {', '.join(SLIDERS)}; got {slider!r}")
+    check_chosen("slider", [slider], SLIDERS)
     setting = SLIDERS[slider]()
     count = setting.n if n is None else n
-    hand = pj.Hand.parallel_jaw(PAD_WIDTH, PAD_THICKNESS)
-    open_jaw, shut_jaw = ((0.0, 0.0, 0.0, opening) for opening in OPENING)
-    path = jnp.concatenate([pj.line(open_jaw, shut_jaw, steps), jnp.asarray([shut_jaw] * HOLD)])
+    hand, path = pj.Hand.parallel_jaw(PAD_WIDTH, PAD_THICKNESS), closing(steps)
     model = pj.FrictionModel(dof=dof, friction=friction)
     slider_by_pressure = {
         name: pj.Slider(setting.shape, fitted_surface(support, "ellipsoid", seed))
@@ -122,29 +120,33 @@ def run(
     }
     starts, resampled = start_poses(next(iter(slider_by_pressure.values())), hand, path[0], setting.circle, count, seed)
     cells, shown = [], {}
-    for k, (name, grasped_slider) in enumerate(slider_by_pressure.items()):
 
-        def report_progress(done: int, total: int, before: int = k * count) -> None:
-            progress(before + done, len(slider_by_pressure) * count)
+    def report_progress(done: int, _: int) -> None:
+        progress(len(cells) * count + done, len(slider_by_pressure) * count)
 
+    for name, grasped_slider in slider_by_pressure.items():
         arguments = jax.random.key(seed + 1), count, grasped_slider, hand, path
         grasps = pj.monte_carlo(*arguments, pose=starts, model=model, progress=report_progress)
         outcomes = classify(grasps, setting.shape, PAD_WIDTH)
         cells.append({"pressure": name} | _results(grasps, outcomes))
         shown[name] = grasps, outcomes
-    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "pad_m": (PAD_WIDTH, PAD_THICKNESS)}
-    settings |= {"opening_m": OPENING, "circle_m": setting.circle, "pairs": PAIRS}
-    pictures = saved(out, lambda: {f"grasp_{slider}.png": _figure(setting.shape, hand, path, starts, shown)})
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "circle_m": setting.circle}
     return result_record(
         f"grasp-{slider}",
-        settings,
+        settings | {"pad_m": (PAD_WIDTH, PAD_THICKNESS), "opening_m": OPENING, "pairs": PAIRS},
         n=count,
         outcomes=cells[0]["outcomes"],
         redrawn=resampled,
         starts=starts,
         cells=cells,
-        pictures=pictures,
+        pictures=saved(out, lambda: {f"grasp_{slider}.png": _figure(setting.shape, hand, path, starts, shown)}),
     )
+
+
+def closing(steps: int) -> jax.Array:
+    """Return the path (steps + 1 + HOLD, 4) of a jaw that closes, and then waits."""
+    open_jaw, shut_jaw = ((0.0, 0.0, 0.0, opening) for opening in OPENING)
+    return jnp.concatenate([pj.line(open_jaw, shut_jaw, steps), jnp.asarray([shut_jaw] * HOLD)])
 
 
 def _results(grasps: pj.MonteCarlo, outcomes: np.ndarray) -> dict[str, Any]:

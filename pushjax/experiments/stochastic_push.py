@@ -34,6 +34,8 @@ ALONG, TRAVEL = 0.018, 0.05  # m: distance of the tip from the middle of the sid
 SUPPORT_POINTS = 64
 N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
 HISTOGRAM_BINS, MAX_PLOTTED, MIN_PUSHES = 40, 2000, 20
+SETUP = {"side_m": SIDE, "radius_m": RADIUS, "along_m": ALONG, "travel_m": TRAVEL}
+SETUP |= {"support_points": SUPPORT_POINTS, "pairs": PAIRS}
 SURFACES_AT_ONCE = 2000  # surfaces that are sampled together
 # A surface counts as convex if its least curvature, relative to its largest coefficient, is at least this. It is not
 # zero because the coefficients are rounded to float32.
@@ -71,14 +73,9 @@ def run(
         progress: Called with the number of pushes done and their total.
 
     Returns:
-        The record, which holds:
-
-            - for each coordinate of the displacement (m, rad): its moments, histogram and test of normality
-            - the correlations of the coordinates
-            - the number of sampled surfaces that are not convex
-            - the share of sampled surfaces that were repaired, and the mean shrinkage of these (see `SurfaceSample`)
-            - the outcomes
-            - the time of the run and that of compiling, in s
+        The record: moments, histogram and test of normality of each coordinate of the displacement (m, rad), and their
+        correlations; how many sampled surfaces are not convex, the share of them that was repaired, and the mean
+        shrinkage of these (see `SurfaceSample`); the outcomes; and the times of the run and of compiling, s.
 
     Raises:
         ValueError: If there are too few pushes for a test of normality.
@@ -86,10 +83,8 @@ def run(
     if n < MIN_PUSHES:
         raise ValueError(f"n must be at least {MIN_PUSHES}, for a test of normality; got {n}")
     slider, hand, path = push_setup(seed, steps)
-    model = pj.FrictionModel(dof=dof, friction=friction)
-    key = jax.random.key(seed + 1)
+    model, key, all_plotted = pj.FrictionModel(dof=dof, friction=friction), jax.random.key(seed + 1), n <= MAX_PLOTTED
     arguments = (key, n, slider, hand, path)
-    all_plotted = n <= MAX_PLOTTED
     options: dict[str, Any] = {"pose": jnp.zeros(3), "model": model, "trajectories": all_plotted}
     first_run = pj.monte_carlo(*arguments, **options, progress=progress)  # includes compiling
     pushes = pj.monte_carlo(*arguments, **options)
@@ -104,11 +99,9 @@ def run(
         cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), drawn.trajectory, title)
         return {"stochastic_push.png": cloud, "stochastic_push_histograms.png": _histograms(described)}
 
-    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
-    settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": SUPPORT_POINTS, "pairs": PAIRS}
     return result_record(
         "stochastic-push",
-        settings,
+        {"seed": seed, "steps": steps, "dof": dof, "friction": friction} | SETUP,
         n=n,
         delta=described,
         correlation=np.corrcoef(delta.T),

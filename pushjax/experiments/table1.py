@@ -216,11 +216,13 @@ def _calibration(predicted: tables.Prediction) -> dict[str, Any]:
     if predicted.found is None:
         return {}
     parameters = predicted.found.parameters
+    offset = parameters.frame_offset
+    assert offset is not None  # `UNKNOWNS` has it
     lengths = {name: getattr(parameters, name) for name in ("pressure_center", "hand_offset", "inset")}
-    lengths |= {"frame_offset": parameters.frame_offset[:2]}
+    lengths |= {"frame_offset": offset[:2]}
     lengths |= {name: getattr(predicted.found, name) for name in ("sigma", "gap_sigma")}
     found = {f"{name}_mm": 1e3 * np.asarray(value, float) for name, value in lengths.items()}
-    return found | {"frame_offset_deg": float(np.degrees(parameters.frame_offset[2]))}
+    return found | {"frame_offset_deg": float(np.degrees(offset[2]))}
 
 
 def summary(record: dict[str, Any]) -> list[str | Table]:

@@ -163,7 +163,7 @@ def _cells(
         log, rng = logs.get((surface, target)), np.random.default_rng(seed + k)
         train = None if log is None else tables.training_masks(np.arange(len(log)), TRAIN_SHARE[method], rng)
         at = OBJECTS.index(target)
-        cell: Cell = {"surface": surface, "object": target, "model": model, "method": method, "mean_mm": None}
+        cell: tables.Cell = {"surface": surface, "object": target, "model": model, "method": method, "mean_mm": None}
         cell |= {"missing": reason_missing(train, method, model)}
         cell |= {"paper_mm": PAPER_MM[surface, model][at], "paper_no_motion_mm": PAPER_NO_MOTION_MM[surface][at]}
         cells.append(cell)

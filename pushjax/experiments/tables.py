@@ -184,7 +184,9 @@ def mean_rows(cells: Sequence[Cell], paper_percent: dict[str, float], left_out: 
         mine = [cell for cell in counted if (cell["method"], cell["model"]) == (method, model)]
         for surface in (*dict.fromkeys(cell["surface"] for cell in mine), "all"):
             some = [cell for cell in mine if surface in (cell["surface"], "all")]
-            values = {key: [cell.get(key) for cell in some] for key in ("mean_mm", "paper_mm", "toolbox_mm")}
+            values: dict[str, list[Any]] = {
+                key: [cell.get(key) for cell in some] for key in ("mean_mm", "paper_mm", "toolbox_mm")
+            }
             figures = {key: None if None in each else float(np.mean(each)) for key, each in values.items()}
             figures["percent"] = float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in some]))
             labels = {"method": method, "model": model, "surface": surface, "conditions": len(some)}
