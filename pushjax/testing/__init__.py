@@ -13,7 +13,7 @@ has two rows, a_n and a_t. Its point on the slider moves by (a_n . V, a_t . V) a
 `violations` measures how far given solutions violate these conditions; `squeeze_power` shows whether a problem that is
 said to have no solution has the physical reason for that; and `search` looks for a solution where a solver found none.
 
-Two more modules use JAX: `testing.problems` generates random problems, and `testing.convexity` checks whether quartics
+Two more modules: `testing.problems` generates random problems with JAX, and `testing.convexity` checks whether quartics
 are convex.
 """
 

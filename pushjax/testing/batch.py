@@ -5,32 +5,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pushjax._math.arrays import ENTRIES
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.quartic import Quartic
+from pushjax.friction.quartic import MONOMIALS, Quartic
 
 if TYPE_CHECKING:
     from pushjax.contact.problem import Contacts
 
-MONOMIALS = "xxxx yyyy zzzz xxxy xxxz xyyy yyyz xzzz yzzz xxyy xxzz yyzz xxyz xyyz xyzz".split()
-PRODUCTS = "xx yy zz xy xz yz".split()
-
-
-def _second_derivatives() -> np.ndarray:
-    """Return (15, 3, 3, 6): the Hessian of each monomial, as coefficients of the six products of two coordinates."""
-    table = np.zeros((15, 3, 3, 6))
-    for k, monomial in enumerate(MONOMIALS):
-        for i, j in np.ndindex(3, 3):
-            power = monomial.count("xyz"[i])
-            rest = monomial.replace("xyz"[i], "", 1)
-            factor = power * rest.count("xyz"[j])
-            if factor:
-                table[k, i, j, PRODUCTS.index(rest.replace("xyz"[j], "", 1))] = factor
-    return table
-
-
-# Shape (15, 3, 3, 6): of each monomial, the Hessian as coefficients of the six `PRODUCTS`.
-HESSIANS = _second_derivatives()
+# Shape (15, 3, 3, 6): of each monomial of a quartic, the Hessian as coefficients of the six products of coordinates.
+_UNITS = np.eye(3, dtype=int)
+_POWERS = MONOMIALS[:, None, None] - _UNITS[:, None] - _UNITS  # left by the two derivatives
+_IS_PRODUCT = np.stack([(_POWERS == _UNITS[i] + _UNITS[j]).all(axis=3) for i, j in ENTRIES], axis=3)
+HESSIANS = (MONOMIALS[:, :, None] * (MONOMIALS[:, None] - _UNITS))[..., None] * _IS_PRODUCT.astype(float)
 
 
 @dataclass(frozen=True)
