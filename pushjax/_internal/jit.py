@@ -21,15 +21,18 @@ try:
 except ImportError:  # JAX up to 0.9
     from jax.core import get_opaque_trace_state  # pyright: ignore[reportAttributeAccessIssue]
 
+try:
+    from jax import enable_x64
+except ImportError:  # JAX up to 0.7
+    from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# JAX 0.11 and later no longer have XLA's fusion emitters, and raise an error for an option that they do not know.
-HAS_FUSION_EMITTERS = jax.__version_info__ < (0, 11)
 # A program that is called by itself runs once or a few times, on one example, for milliseconds, so the user waits only
 # for its compilation. Level 0 is not an option: without fusion emitters, one solve in a hundred then does not converge.
 QUICK_OPTIONS: dict[str, str | bool | int] = {"xla_backend_optimization_level": 1}
-if HAS_FUSION_EMITTERS:
+if jax.__version_info__ < (0, 11):  # later versions have no fusion emitters, and reject options that they do not know
     QUICK_OPTIONS["xla_cpu_use_fusion_emitters"] = False
 with ThreadPoolExecutor(1) as thread:  # this module may be imported within a trace, but a new thread has none
     NO_TRACE = thread.submit(get_opaque_trace_state).result()
@@ -71,6 +74,19 @@ def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
         return (quick if outside_trace() else thorough)(*args, **kwargs)
 
     return without_gc(call)
+
+
+def with_own_floats(function: Callable[P, R]) -> Callable[P, R]:
+    """Return `function` for another thread, where it computes with the caller's choice of float64 or float32."""
+    # `jax.enable_x64` holds for one thread: another one has the default, and would mix the types of both
+    x64 = jnp.zeros(()).dtype == jnp.float64
+
+    @functools.wraps(function, updated=())
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        with enable_x64(x64):
+            return function(*args, **kwargs)
+
+    return call
 
 
 def without_gc(function: Callable[P, R]) -> Callable[P, R]:

@@ -40,7 +40,9 @@ COEFFICIENTS = np.einsum("cijkl,aij,bkl->cab", TENSORS, UNITS, UNITS)
 # In the norm that does not depend on the frame all of them are orthogonal. So a projection of G gives N.
 PROJECTIONS = ADJUGATES / np.outer(UNITS.sum(axis=(1, 2)), UNITS.sum(axis=(1, 2)))
 PROJECTIONS /= np.sum(ADJUGATES * PROJECTIONS, axis=(1, 2), keepdims=True)
-LOWER = np.zeros((7, 7), int)  # where the entries of a symmetric 7 x 7 matrix stand in its lower triangle
+# Where the entries of a symmetric 7 x 7 matrix stand in its lower triangle. The type is not int64, because JAX would
+# keep the type that it makes of this in one context of `enable_x64` for the next.
+LOWER = np.zeros((7, 7), np.int32)
 LOWER[np.tril_indices(7)] = np.arange(28)
 LOWER = np.maximum(LOWER, LOWER.T)
 

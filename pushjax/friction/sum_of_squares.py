@@ -18,7 +18,7 @@ from pushjax.friction.quartic import MONOMIALS
 # With this many terms, a fit is close to the optimum over all convex quartics. `pushjax.friction.fit` says how close.
 TERMS = 5
 MAX_STEPS = 100  # of the Levenberg-Marquardt method
-_LOWER_INDICES = np.tril_indices(3)
+_LOWER_INDICES = np.array(np.tril_indices(3), np.int32)
 LOWER_ENTRIES = np.eye(9)[np.flatnonzero(np.tril(np.ones((3, 3))))]  # (6, 9), from a lower triangle to a matrix
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import Array
 
-from pushjax._internal.jit import QUICK_OPTIONS, without_gc
+from pushjax._internal.jit import QUICK_OPTIONS, with_own_floats, without_gc
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.status import ContactMode
 from pushjax.contact.sticking import StickingSolver
@@ -130,10 +130,11 @@ class Rounds:
         shapes = draw_tile.eval_shape(*draw_args[0])
         # In parallel, because each device compiles its own programs, once. XLA compiles without Python's lock, and JAX
         # keeps what is traced here for the calls that follow.
-        drawn = [pool.submit(draw_tile, *args) for args in draw_args]
+        draw_there, push_there = with_own_floats(draw_tile), with_own_floats(push_tile)
+        drawn = [pool.submit(draw_there, *args) for args in draw_args]
         push_tile.trace(self.keep_trajectories, setups[0], shapes, paths[0], poses[0])
         draws = [each.result() for each in drawn]
-        return list(pool.map(partial(push_tile, self.keep_trajectories), setups, draws, paths, poses))
+        return list(pool.map(partial(push_there, self.keep_trajectories), setups, draws, paths, poses))
 
 
 def _draw_tile(steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array) -> Draws:
