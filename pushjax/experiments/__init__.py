@@ -1,1 +1,1 @@
-"""The experiments, one module or package each."""
+"""The experiments, one module each; a module with an underscore is shared."""

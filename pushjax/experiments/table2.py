@@ -135,6 +135,7 @@ def run(
     cells = [
         cell for model in MODELS for name in method for cell in _cells(name, model, logs, assumed, steps, seed, begin)
     ]
+    progress(total, total)
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
     settings |= assumed._asdict() | {"method": list(method), "train_share": TRAIN_SHARE}
     title = "Triangle on three points: final pose, predicted against measured"
