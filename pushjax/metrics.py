@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, checked_array, common_dtype
 from pushjax._internal.jit import quick_jit
 
 # The smallest bandwidth of a density estimate, in m. No tracker resolves less, and grasps end in distributions that
@@ -145,9 +145,8 @@ def log_density(
 @jax.jit
 def _log_density(x: Array, y: Array, scale: Array, min_bandwidth: Array) -> Array:
     points, observed_points = _flat_points(x, y, scale)
-    kernel = _Kernel(points, min_bandwidth, scale)
-    log_sums = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log_densities(p)), observed_points.reshape(-1, 3))
-    return log_sums.reshape(observed_points.shape[:-1]) - jnp.log(jnp.asarray(x.shape[0], x.dtype))
+    log_sums = _Kernel(points, min_bandwidth, scale).log_sums(observed_points)
+    return log_sums.reshape(y.shape[:-1]) - jnp.log(jnp.asarray(x.shape[0], x.dtype))
 
 
 def coverage(
@@ -198,14 +197,10 @@ def _coverage(x: Array, y: Array, scale: Array, levels: Array, min_bandwidth: Ar
         return jax.nn.logsumexp(jnp.where(jnp.arange(len(points)) == index, -jnp.inf, log_densities))
 
     sample_log_densities = jax.lax.map(leave_one_out, jnp.arange(len(points)))
-    observed_log_densities = jax.lax.map(
-        lambda p: jax.nn.logsumexp(kernel.log_densities(p)), observed_points.reshape(-1, 3)
-    )
     thresholds = jnp.quantile(sample_log_densities, 1 - levels)
     # leave-one-out densities sum n - 1 kernels, those of observations n: give both the same normalization
-    observed_log_densities = observed_log_densities - jnp.log(
-        jnp.asarray(len(points) / (len(points) - 1), sample_log_densities.dtype)
-    )
+    excess = jnp.log(jnp.asarray(len(points) / (len(points) - 1), sample_log_densities.dtype))
+    observed_log_densities = kernel.log_sums(observed_points) - excess
     return jnp.mean(observed_log_densities[None] >= thresholds[:, None], axis=1, dtype=sample_log_densities.dtype)
 
 
@@ -238,6 +233,10 @@ class _Kernel:
         offsets = self.points[None] - self._whitened(images)[:, None]
         return jax.nn.logsumexp(-jnp.sum(offsets**2, axis=2) / 2, axis=0) - self.log_normalization
 
+    def log_sums(self, points: Float[Array, "*observations 3"]) -> Float[Array, "n"]:
+        """Return the log of the sum of all kernels at each of the points, m."""
+        return jax.lax.map(lambda point: jax.nn.logsumexp(self.log_densities(point)), points.reshape(-1, 3))
+
 
 def _flat_points(samples: Array, observed: Array, length: Array) -> tuple[Array, Array]:
     """Return samples and observations as points (x, y, length * theta), m, relative to the mean of the samples."""
@@ -255,14 +254,11 @@ def _flat_points(samples: Array, observed: Array, length: Array) -> tuple[Array,
 def _checked(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> tuple[Array, Array, Array]:
     """Return the arguments as arrays of one dtype, or raise ValueError."""
     dtype = common_dtype(samples, observed, length)
-    named = (("samples", samples), ("observed", observed), ("length", length))
-    x, y, scale = (as_float(value, dtype, name) for name, value in named)
+    x, y = as_float(samples, dtype, "samples"), as_float(observed, dtype, "observed")
     if x.ndim != 2 or x.shape[1] != 3 or x.shape[0] < 2:
         raise ValueError(f"samples has shape {x.shape}; expected (n, 3), at least two")
     if y.ndim not in (1, 2) or y.shape[-1] != 3:
         raise ValueError(f"observed has shape {y.shape}; expected (3,) or (observations, 3)")
-    for name, value in (("samples", x), ("observed", y), ("length", scale)):
-        check_finite(name, value)
-    check_shape("length", scale, ())
-    check_positive("length", scale)
-    return x, y, scale
+    check_finite("samples", x)
+    check_finite("observed", y)
+    return x, y, checked_array("length", length, (), dtype, positive=True)

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from pushjax.datasets.checks import FORCE, HAND, OBJECT, checked_recording, collect_checked
 from pushjax.datasets.recordings import FACTS, Floats, LogError, Recording, Recordings, quoted
 
-# Columns of a table: all of _REQUIRED, and any groups of _OPTIONAL_GROUPS, each as a whole.
+# Columns of a table; only those of _REQUIRED have to be there.
 _PUSH = "push"
 _REQUIRED = (_PUSH, *HAND[:2], *OBJECT)
-_OPTIONAL_GROUPS = (("hand_theta",), ("hand_theta", "hand_distance"), ("time",), FORCE)
 COLUMNS = (_PUSH, *HAND, *OBJECT, "time", *FORCE)
 # A row may lack all numbers of the object's pose, if the object was not tracked, or of the force, if none was measured.
 _MAY_BE_BLANK = (*OBJECT, *FORCE)
@@ -97,10 +96,12 @@ def _nonblank_rows(path: Path) -> Iterator[_Row]:
 def _check_header(path: Path, header: _Row) -> list[str]:
     """Return the names of the columns; LogError if one is unknown, missing or duplicated."""
     names = [cell.strip() for cell in header.cells]
-    missing = [name for name in _REQUIRED if name not in names]
-    for group in _OPTIONAL_GROUPS:
-        if group[-1] in names or (group == FORCE and group[0] in names):
-            missing += [name for name in group if name not in names and name not in missing]
+    needed: list[str] = list(_REQUIRED)
+    if "hand_distance" in names:
+        needed.append("hand_theta")
+    if not set(FORCE).isdisjoint(names):
+        needed += FORCE
+    missing = [name for name in needed if name not in names]
     unknown = [name for name in names if name not in COLUMNS]
     duplicated = sorted({name for name in names if names.count(name) > 1})
     kinds = (("no", missing), ("unknown", [quoted(name) for name in unknown]), ("more than one", duplicated))

@@ -163,19 +163,12 @@ class Recordings:
         """
         if not self.pushes:
             raise ValueError("pushes: expected at least one to save; got none")
-        columns: dict[str, list[Any]] = {
-            "path": [push.hand for push in self.pushes],
-            "pose": [push.pose for push in self.pushes],
-            "force": [push.force for push in self.pushes],
-            "time": [push.time for push in self.pushes],
-            "wrench": [push.wrench for push in self.pushes],
-            "twist": [push.twist for push in self.pushes],
-        }
+        fields = {"path": "hand"} | {name: name for name in ("pose", "force", "time", "wrench", "twist")}
+        columns = {name: [getattr(push, field) for push in self.pushes] for name, field in fields.items()}
         arrays = {name: _padded(rows) for name, rows in columns.items() if all(row is not None for row in rows)}
         arrays["index"] = np.array([push.index for push in self.pushes])
         arrays |= {f"about_{name}": self.about(name) for name in self.pushes[0].about}
-        facts = (getattr(self, name) for name in FACTS)
-        arrays |= {name: np.asarray(fact) for name, fact in zip(FACTS, facts, strict=True) if fact is not None}
+        arrays |= {name: np.asarray(fact) for name in FACTS if (fact := getattr(self, name)) is not None}
         if self.problems:
             arrays["problem"] = np.array([problem.message for problem in self.problems])
             arrays["problem_push"] = np.array([-1 if each.push is None else each.push for each in self.problems])

@@ -78,19 +78,6 @@ def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, rob
     return weight if robust is None else weight / jnp.sqrt(1 + squared / robust**2)
 
 
-class Rounds(NamedTuple):
-    """Number of rounds and tolerance of a fit."""
-
-    count: Int[Array, ""]  # alternations between z and sigma; one is enough if all of sigma is known
-    tolerance: Float[Array, ""]  # of z in the last round
-
-    @staticmethod
-    def of(dtype, count: int, tolerance: float | None = None) -> "Rounds":
-        """Return the rounds for a floating dtype; the default tolerance is 1e-6 in float64, 1e-4 in float32."""
-        default = 1e-6 if dtype == jnp.float64 else 1e-4
-        return Rounds(jnp.asarray(count), jnp.asarray(default if tolerance is None else tolerance, dtype))
-
-
 def _evidence(
     residual: ResidualKinds,  # at the minimizer, (conditions, pushes, rows) of each kind
     jacobian: ResidualKinds,  # its derivatives (conditions, pushes, rows, size) with respect to z
@@ -153,7 +140,8 @@ def fit(
     sigma: Float[Array, "3"],  # initial or known standard deviations of poses (m), of directions, and of gaps (m)
     sigma_is_given: Bool[Array, "3"],
     frozen: Bool[Array, "size"],  # entries of z that stay as in `start`
-    rounds: Rounds,
+    rounds: Int[Array, ""],  # alternations between z and sigma; one is enough if all of sigma is known
+    tolerance: Float[Array, ""],  # of z in the last round
     *,
     robust: float | None,  # number of sigma from which a push has less influence; None: least squares
 ) -> Fit:
@@ -170,8 +158,8 @@ def fit(
             linear_residuals = problem.linear_residuals(z, linearized)
             return (weighted_residuals(linear_residuals, pushes, sigma, robust), has_normal_prior * z), linearized
 
-        tolerance = jnp.where(index < rounds.count - 1, LOOSE_TOLERANCE, rounds.tolerance).astype(start.dtype)
-        solver = _LevenbergMarquardt(tolerance)
+        is_last = index == rounds - 1
+        solver = _LevenbergMarquardt(jnp.where(is_last, tolerance, LOOSE_TOLERANCE).astype(start.dtype))
         found = optx.least_squares(residuals, solver, before.z, has_aux=True, max_steps=MAX_STEPS, throw=False)
         z, residual = jnp.where(frozen, start, found.value), found.aux.value
         jacobian = problem.jacobian(z, found.aux)
@@ -181,7 +169,7 @@ def fit(
         steps, converged = before.steps + found.stats["num_steps"], found.result == optx.RESULTS.successful
         new_sigma = jnp.where(sigma_is_given, sigma, jnp.maximum(new_sigma, MIN_SIGMA))
         # The last round keeps the sigma with which it fitted.
-        sigma = jnp.where(index < rounds.count - 1, new_sigma, sigma)
+        sigma = jnp.where(is_last, sigma, new_sigma)
         return Fit(z, sigma, precision, residual, information, minimum, steps, converged)
 
     leading, size = pushes.weight.shape, len(start)
@@ -190,4 +178,4 @@ def fit(
     residual = ResidualKinds(*(jnp.zeros((*leading, count), start.dtype) for count in rows))
     no_steps, not_converged = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     first = Fit(start, sigma, precision, residual, information, minimum, no_steps, not_converged)
-    return jax.lax.fori_loop(0, rounds.count, one_round, first)
+    return jax.lax.fori_loop(0, rounds, one_round, first)

@@ -8,17 +8,16 @@ from jaxtyping import Array
 
 from pushjax._internal.checks import (
     ArrayLike,
-    as_float,
-    check_finite,
     check_non_negative,
     check_positive,
     check_shape,
     check_type,
+    checked_array,
     common_dtype,
 )
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.identification.fit import SIGMA_ROUNDS, Rounds, fit, sum_of_squares, weighted_residuals
+from pushjax.identification.fit import SIGMA_ROUNDS, fit, sum_of_squares, weighted_residuals
 from pushjax.identification.model import Problem, Scene
 from pushjax.identification.prior import Prior
 from pushjax.identification.pushes import Pushes
@@ -101,10 +100,10 @@ def identify(
     known_values = {"friction": per_condition("friction", friction, (), conditions, dtype)}
     check_non_negative("friction", known_values["friction"])
     known_values |= known_parameters(known or {}, unknowns, conditions, dtype)
-    metric_length = surface.length[0] if length is None else as_float(length, dtype, "length")
-    pose_sigma = as_float(START_SIGMA if sigma is None else sigma, dtype)
+    metric_length = checked_array("length", surface.length[0] if length is None else length, (), dtype, positive=True)
+    pose_sigma = checked_array("sigma", START_SIGMA if sigma is None else sigma, (), dtype, positive=True)
     needs_round_finger = {"overlap": "overlap" in (*unknowns.names, *known_values), "contact_at_end": contact_at_end}
-    _check_settings(pushes, hand, metric_length, pose_sigma, robust, needs_round_finger)
+    _check_settings(pushes, hand, robust, needs_round_finger)
     prior = _prior(unknowns, surface, known_values, _mean_start(pushes))
     problem = Problem(Scene(slider.shape, hand, prior.origin), surface, prior, metric_length, contact_at_end)
     has_pairs = pushes.wrench.shape[-2] > 0
@@ -112,8 +111,10 @@ def identify(
     sigma_is_given = (sigma is not None, not has_pairs, not contact_at_end)
     start_sigma = jnp.stack([pose_sigma, *jnp.asarray([START_DIRECTION_SIGMA, START_GAP_SIGMA], dtype)])
     start = _best_start(problem, pushes, start_sigma, robust=robust)
-    frozen, rounds = jnp.zeros(start.shape, bool), Rounds.of(dtype, 1 if all(sigma_is_given) else SIGMA_ROUNDS)
-    fitted = fit(problem, pushes, start, start_sigma, jnp.array(sigma_is_given), frozen, rounds, robust=robust)
+    given, frozen = jnp.array(sigma_is_given), jnp.zeros(start.shape, bool)
+    rounds = jnp.asarray(1 if all(sigma_is_given) else SIGMA_ROUNDS)
+    tolerance = jnp.asarray(1e-6 if dtype == jnp.float64 else 1e-4, dtype)
+    fitted = fit(problem, pushes, start, start_sigma, given, frozen, rounds, tolerance, robust=robust)
     # `Problem` divides pose residuals by the root of the number of poses, so that the poses of a push count as one.
     final_pose_residual = fitted.residual.poses[..., -3:] * len(pushes.observed_steps) ** 0.5
     per_push = (final_pose_residual, fitted.information)
@@ -149,18 +150,12 @@ def _mean_start(pushes: Pushes) -> Array:
 def _check_settings(
     pushes: Pushes,
     hand: Hand,
-    length: Array,
-    sigma: Array,
     robust: float | None,
     needs_round_finger: Mapping[str, bool],  # whether each argument for a single round finger was given
 ) -> None:
     """Check that the settings of `identify` fit each other and the hand."""
     if pushes.path.shape[-1] != hand.dof:
         raise ValueError(f"path has {pushes.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
-    for name, value in (("length", length), ("sigma", sigma)):
-        check_shape(name, value, ())
-        check_finite(name, value)
-        check_positive(name, value)
     if robust is not None:
         check_positive("robust", robust)
     for name, requested in needs_round_finger.items():

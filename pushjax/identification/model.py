@@ -199,7 +199,9 @@ def predict_push(
     if offset is not None:
         start = compose(start, offset)
     if parameters.overlap is not None:
-        path = path.at[:, :2].add(parameters.overlap * overlap_vector(slider, hand, start, path[0])[None])
+        distance, normal, radius = finger_distance(shape, hand, start, path[0])
+        way_out = jnp.maximum(radius - distance, 0.0) * transform(start.at[:2].set(0.0), normal)  # world, m
+        path = path.at[:, :2].add(parameters.overlap * way_out[None])
     mu, by_side = parameters.friction, parameters.friction_by_side
     if parameters.friction_drift is not None:
         mu = mu * jnp.exp(parameters.friction_drift * push.age)
@@ -216,12 +218,6 @@ def predict_push(
 def _true_path(parameters: Parameters, push: Pushes) -> Array:
     """Return the true path (steps + 1, dof) of the hand in one push."""
     return correct_path(push.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
-
-
-def overlap_vector(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
-    """Return the shortest displacement of a round finger, world, m, out of the slider; zero if they are apart."""
-    distance, normal, radius = finger_distance(slider.shape, hand, start, configuration)
-    return jnp.maximum(radius - distance, 0.0) * transform(start.at[:2].set(0.0), normal)
 
 
 def finger_distance(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:

@@ -8,15 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_finite,
-    check_non_negative,
-    check_shape,
-    check_type,
-    common_dtype,
-)
+from pushjax._internal.checks import ArrayLike, as_float, check_shape, check_type, checked_array, common_dtype
 from pushjax.datasets.recordings import Recordings
 from pushjax.geometry.shape import Shape
 from pushjax.identification.pushes_of_recordings import push_arrays
@@ -74,26 +66,26 @@ class Pushes(eqx.Module):
         side: ArrayLike | None = None,
     ):
         dtype = common_dtype(start, path, end)
-        self.start, self.path, self.end = (as_float(value, dtype) for value in (start, path, end))
-        if self.start.ndim not in (2, 3):
-            raise ValueError(f"start has shape {self.start.shape}; expected (pushes, 3), or with conditions in front")
-        leading = self.start.shape[:-1]
-        zeros, no_rows = jnp.zeros(leading, dtype), jnp.zeros((*leading, 0, 3), dtype)
+        starts = as_float(start, dtype, "start")
+        leading = starts.shape[:-1]
+        if starts.ndim not in (2, 3):
+            raise ValueError(f"start has shape {starts.shape}; expected (pushes, 3), or with conditions in front")
+        zeros, no_rows = np.zeros(leading), np.zeros((*leading, 0, 3))
 
-        def given(value: ArrayLike | None, default: Array, name: str) -> Array:
-            return default if value is None else as_float(value, dtype, name)
+        def checked(
+            name: str, value: ArrayLike, shape: tuple[int | str, ...] = (), non_negative: bool = False
+        ) -> Array:
+            return checked_array(name, value, (*leading, *shape), dtype, non_negative=non_negative)
 
-        self.weight = given(weight, jnp.ones(leading, dtype), "weight")
-        self.age, self.side = given(age, zeros, "age"), given(side, zeros, "side")
-        self.poses_between = given(poses_between, no_rows, "poses_between")
-        self.wrench, self.twist = given(wrench, no_rows, "wrench"), given(twist, no_rows, "twist")
-        check_shape("end", self.end, (*leading, 3))
-        check_shape("path", self.path, (*leading, "steps + 1", "dof"))
-        for name in ("weight", "age", "side"):
-            check_shape(name, getattr(self, name), leading)
-        check_shape("poses_between", self.poses_between, (*leading, "k", 3))
-        check_shape("wrench", self.wrench, (*leading, "p", 3))
-        check_shape("twist", self.twist, self.wrench.shape)
+        self.start = checked("start", starts, (3,))
+        self.path = checked("path", path, ("steps + 1", "dof"))
+        self.end = checked("end", end, (3,))
+        self.weight = checked("weight", zeros + 1 if weight is None else weight, non_negative=True)
+        self.poses_between = checked("poses_between", no_rows if poses_between is None else poses_between, ("k", 3))
+        self.wrench = checked("wrench", no_rows if wrench is None else wrench, ("p", 3))
+        self.twist = checked("twist", no_rows if twist is None else twist, self.wrench.shape[-2:])
+        self.age = checked("age", zeros if age is None else age)
+        self.side = checked("side", zeros if side is None else side, non_negative=True)
         steps, between = self.path.shape[-2] - 1, self.poses_between.shape[-2]
         if steps < 1:
             raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
@@ -101,10 +93,6 @@ class Pushes(eqx.Module):
             raise ValueError(
                 f"poses_between has {between} poses for each push; a path of {steps} steps has room for {steps - 1}"
             )
-        for name, value in vars(self).items():
-            check_finite(name, value)
-        check_non_negative("weight", self.weight)
-        check_non_negative("side", self.side)
 
     @property
     def observed_steps(self) -> np.ndarray:
@@ -164,23 +152,19 @@ class Pushes(eqx.Module):
         if not several:
             raise ValueError("several: expected at least one condition's pushes; got none")
         longest = max(one.weight.shape[0] for one in several)
-        names = tuple(vars(several[0]))
-        for name in names:
+        for name in vars(several[0]):
             shapes = {getattr(one, name).shape[1:] for one in several}
             if len(shapes) > 1:
                 raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
+        rows = np.arange(longest)
 
-        def padded(name: str) -> Array:
-            """Stack one field of all conditions, padded with copies of each condition's first push."""
-            rows = []
-            for one in several:
-                value = getattr(one, name)
-                missing = longest - value.shape[0]
-                padding = jnp.broadcast_to(value[:1], (missing, *value.shape[1:]))
-                rows.append(jnp.concatenate([value, 0 * padding if name == "weight" else padding]))
-            return jnp.stack(rows)
+        def padded(one: "Pushes") -> "Pushes":
+            """Append copies of the first push, of weight zero."""
+            exists = rows < len(one.weight)
+            filled = jax.tree.map(lambda leaf: leaf[np.where(exists, rows, 0)], one)
+            return filled.weighted(jnp.where(exists, filled.weight, 0.0))
 
-        return Pushes(**{name: padded(name) for name in names})
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(padded, several))
 
     def weighted(self, weight: ArrayLike) -> "Pushes":
         """Return the same pushes with other weights, for example of a training set or a bootstrap sample.

@@ -23,6 +23,7 @@ from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
 FORMAT, VERSION = "pushjax identified", 2
+FLAGS = ("one_condition", "robust", "contact_at_end")
 ARRAYS = ("z", "precision", "sigma", "direction_sigma", "gap_sigma", "residual", "information", "loss", "length")
 # Unknowns that slider, hand and path can represent.
 CORRECTABLE = ("friction", "surface", "pressure_center", "inset", "overshoot", "lag_distance", "hand_offset")
@@ -290,16 +291,13 @@ class Identified(eqx.Module):
 def to_record(found: Identified) -> dict[str, Any]:
     """Return the result as a dictionary of numbers and lists, for a JSON file."""
     unknowns, mean = found.prior.unknowns, found.prior.mean_surface
-    record: dict[str, Any] = {"one_condition": found.one_condition, "robust": found.robust}
-    record["contact_at_end"] = found.contact_at_end
+    record: dict[str, Any] = {name: getattr(found, name) for name in FLAGS}
     record |= {"steps": int(found.steps), "converged": bool(found.converged), "labels": found.labels}
     record |= {name: to_list(getattr(found, name)) for name in ARRAYS}
     record["unknowns"] = {
         name: to_list(getattr(unknowns, name)) for name in ("friction", "surface_dof", *NORMAL_PRIORS)
     }
-    record["sides"] = unknowns.sides
-    record["shared"] = unknowns.shared
-    record["origin"] = to_list(found.prior.origin)
+    record |= {"sides": unknowns.sides, "shared": unknowns.shared, "origin": to_list(found.prior.origin)}
     record["known"] = {name: to_list(value) for name, value in found.prior.known.items()}
     record["mean_surface"] = {name: to_list(getattr(mean, name)) for name in ("factors", "relative_std", "length")}
     # The estimates are for people who read the file. `from_record` computes them again.
@@ -326,10 +324,8 @@ def from_record(record: dict[str, Any], dtype: Any) -> Identified:
         raise ValueError(f"its z has shape {arrays['z'].shape}; what it says was unknown has ({layout.size},)")
     return Identified(
         **arrays,
+        **{name: record[name] for name in FLAGS},
         prior=prior,
         steps=jnp.asarray(record["steps"], jnp.int32),
         converged=jnp.asarray(record["converged"], bool),
-        one_condition=bool(record["one_condition"]),
-        robust=record["robust"],
-        contact_at_end=record["contact_at_end"],
     )

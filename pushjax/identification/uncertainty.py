@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.special import ndtri
 
 from pushjax._internal.jit import jit
-from pushjax.identification.fit import Rounds, fit
+from pushjax.identification.fit import Fit, fit
 from pushjax.identification.model import Problem, Scene, limit_surfaces
 from pushjax.identification.pushes import Pushes
 from pushjax.simulation.hand import Hand
@@ -66,12 +66,11 @@ def profile(
     std = float(np.sqrt(np.asarray(covariance)[position, position]))
     # The direction in which all other entries would move if the posterior were normal.
     direction = covariance[position] / covariance[position, position] * std
-    frozen, rounds = jnp.arange(len(found.z)) == position, Rounds.of(found.z.dtype, 1, TOLERANCE)
-    sigma, given = _sigma_by_kind(found), jnp.ones(3, bool)
+    frozen, sigma = jnp.arange(len(found.z)) == position, _sigma_by_kind(found)
 
     def refit(near: _ProfilePoint, distance: float) -> _ProfilePoint:
         z = near.z + (distance - near.distance) * direction
-        fitted = fit(problem, pushes, z, sigma, given, frozen, rounds, robust=found.robust)
+        fitted = _refit(problem, pushes, z, sigma, frozen, found.robust)
         return _ProfilePoint(distance, fitted.z, float(fitted.loss))
 
     estimate = refit(_ProfilePoint(0.0, found.z, 0.0), 0.0)
@@ -146,12 +145,14 @@ def bootstrap(
 @jit
 def _refitted(problem: Problem, pushes: Pushes, start, sigma, weights, robust: float | None):
     """Fit z to each row of `weights`, with sigma fixed."""
-    given, frozen, rounds = jnp.ones(3, bool), jnp.zeros(start.shape, bool), Rounds.of(start.dtype, 1, TOLERANCE)
+    frozen = jnp.zeros(start.shape, bool)
+    return jax.vmap(lambda weight: _refit(problem, pushes.weighted(weight), start, sigma, frozen, robust).z)(weights)
 
-    def fit_weighted(weight):
-        return fit(problem, pushes.weighted(weight), start, sigma, given, frozen, rounds, robust=robust).z
 
-    return jax.vmap(fit_weighted)(weights)
+def _refit(problem: Problem, pushes: Pushes, start: Array, sigma: Array, frozen: Array, robust: float | None) -> Fit:
+    """Fit those entries of z that are not frozen, with sigma fixed."""
+    given, tolerance = jnp.ones(3, bool), jnp.asarray(TOLERANCE, start.dtype)
+    return fit(problem, pushes, start, sigma, given, frozen, jnp.asarray(1), tolerance, robust=robust)
 
 
 def scalar_positions(found: "Identified") -> dict[str, int]:

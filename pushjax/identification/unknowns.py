@@ -1,13 +1,13 @@
 """The unknowns of identification, and the physical parameters that they stand for."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, concrete
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, checked_array, concrete
 
 
 class _Unknown(NamedTuple):
@@ -48,11 +48,6 @@ def _prior(value: ArrayLike | None) -> Array | None:
     return None if value is None else as_float(value)
 
 
-def _shared_names(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of the shared unknowns as a tuple, or the calibration parameters for None."""
-    return CALIBRATION if names is None else tuple(names)
-
-
 class Unknowns(eqx.Module):
     """What `identify` estimates, and the prior of each unknown. A parameter whose prior is None is not estimated.
 
@@ -80,7 +75,7 @@ class Unknowns(eqx.Module):
         anisotropy: Dependence of the table friction on direction; see `Table`.
         log_gradient: 1/m, gradient of the logarithm of the table friction, at the mean start position of the pushes;
             see `Table`.
-        log_hessian: 1/m^2, second derivatives of the logarithm of the table friction; see `Table`.
+        log_hessian: 1/m^2, second derivatives (xx, yy, xy) of the logarithm of the table friction; see `Table`.
         friction_drift: Increase of the logarithm of the hand's friction from `Pushes.age` zero to one.
         friction_by_side: Difference of the logarithm of the hand's friction on each side of the slider (`Pushes.side`).
         sides: Number of sides of the slider. Default: 4.
@@ -107,11 +102,14 @@ class Unknowns(eqx.Module):
     friction_drift: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
     friction_by_side: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
     sides: int = eqx.field(default=4, static=True, kw_only=True)
-    shared: tuple[str, ...] = eqx.field(default=None, converter=_shared_names, static=True, kw_only=True)
+    shared: tuple[str, ...] = eqx.field(default=CALIBRATION, converter=tuple, static=True, kw_only=True)
 
     def __check_init__(self):
         if self.friction is not None:
-            _check_range(self.friction)
+            low_high = concrete(checked_array("friction", self.friction, (2,)))
+            if low_high is not None and not 0 <= low_high[0] < low_high[1]:
+                low, high = low_high
+                raise ValueError(f"friction must be (lowest, highest), not negative; got ({low:g}, {high:g})")
         for name in ("surface_dof", *NORMAL_PRIORS):
             prior = getattr(self, name)
             if prior is not None:
@@ -131,16 +129,6 @@ class Unknowns(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """Names of the parameters that are estimated."""
         return tuple(name for name in NAMES if getattr(self, "surface_dof" if name == "surface" else name) is not None)
-
-
-def _check_range(friction: Array) -> None:
-    """Check that the prior of the friction is a pair (lowest, highest) with 0 <= lowest < highest."""
-    if friction.shape != (2,):
-        raise ValueError(f"friction has shape {friction.shape}; expected (2,), lowest and highest")
-    check_finite("friction", friction)
-    bounds = concrete(friction)
-    if bounds is not None and not 0 <= bounds[0] < bounds[1]:
-        raise ValueError(f"friction must be (lowest, highest), not negative; got ({bounds[0]:g}, {bounds[1]:g})")
 
 
 def known_parameters(
@@ -170,27 +158,11 @@ def per_condition(name: str, value: ArrayLike, shape: tuple[int, ...], condition
 
 
 class Parameters(NamedTuple):
-    """Physical parameters on which the pushes of a condition depend.
+    """Physical parameters on which the pushes of a condition depend: the values of what `Unknowns` describes.
 
-    Fields from `frame_offset` on are None if they are neither estimated nor known.
-
-    Attributes:
-        friction: Friction coefficient mu.
-        surface: Coefficients of the limit surface about the origin of the body frame: (15,) of a quartic, or (3, 3) of
-            an ellipsoid.
-        pressure_center: (2,) m, center of pressure relative to that of the mean surface, in the body frame; `surface`
-            already includes it.
-        inset: m, by how much the outline or the finger is smaller than given.
-        overshoot: m, distance that the hand went on after the end of its path.
-        lag_distance: m, distance by which the hand lags its logged position.
-        hand_offset: (2,) m, displacement of the hand, world.
-        frame_offset: (3,) pose of the slider's body frame in the tracked frame, m and rad.
-        overlap: Fraction of the initial penetration that is a measurement error.
-        anisotropy: (2,) dependence of the table friction on direction.
-        log_gradient: (2,) gradient of the logarithm of the table friction, 1/m.
-        log_hessian: (3,) second derivatives xx, yy, xy of the logarithm of the table friction, 1/m^2.
-        friction_drift: Increase of log(mu) from the first push to the last.
-        friction_by_side: (sides,) difference of log(mu) on each side.
+    Units are those of `Unknowns`, but the angle of `frame_offset` is in rad. `surface` is the limit surface about the
+    origin of the body frame, as coefficients (15,) of a quartic or A (3, 3) of an ellipsoid. It already includes
+    `pressure_center`. Fields from `frame_offset` on are None if they are neither estimated nor known.
     """
 
     friction: Float[Array, ""]
