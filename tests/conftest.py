@@ -35,32 +35,10 @@ gc.set_threshold(100_000, 50, 100)
 
 # Each free worker takes the next file. The long files come first, so that none of them ends long after the others.
 LONG = (
-    "docs",
-    "overlaps",
-    "invariance",
-    "table1",
-    "random_contacts",
-    "commands",
-    "grasps",
-    "impact",
-    "more_tasks",
-    "bench",
-    "push_t",
-    "fixtures",
-    "gym",
-    "pusht_mpc",
-    "identify_logs",
-    "identify",
-    "friction_model",
-    "derivatives",
-    "smooth_shapes",
-    "table",
-    "contact_derivatives",
-    "single_contact",
-    "several_contacts",
-    "monte_carlo",
-    "rollout",
-    "continuing",
+    *("docs", "overlaps", "invariance", "grasps", "random_contacts", "commands", "table1", "more_tasks", "rollout"),
+    *("identify_logs", "identify", "derivatives", "bench", "push_t_episodes", "push_t", "fixtures", "gym", "search"),
+    *("friction_model", "single_contact", "contact_derivatives", "several_contacts", "impact", "pusht_mpc"),
+    *("smooth_shapes", "table", "monte_carlo", "continuing", "smooth_pads", "table2", "two_finger", "among_fixtures"),
 )
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"

@@ -11,7 +11,6 @@ import pushjax as pj
 from benchmarks import cases, contacts, grasps, numerics, reference_push, speed, timing
 from benchmarks.__main__ import MODULES, listing, main
 from benchmarks.hlo import traffic
-from benchmarks.peers import rows
 from pushjax.testing.problems import random_contacts_problem
 
 
@@ -25,17 +24,6 @@ def test_errors_fall_with_the_square_of_the_step():
     assert single[16] == pytest.approx(by_steps[16], abs=2e-3)
     with pytest.raises(ValueError, match="within 1e-09 mm"):
         reference_push.fewest_steps(by_steps, 1e-9)
-
-
-@pytest.mark.slow
-def test_no_slip_where_it_sticks():
-    """A sticking tip rolls as the side turns; the slip that is left is the discretization error, nanometers."""
-    coarse, fine = (max(rows.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))
-    assert coarse < 0.01
-    assert fine < coarse / 10
-    assert max(rows.slip_um("float32", (0.004, 0.01))) < 0.1  # roundoff of 50 steps
-    with pytest.raises(ValueError, match="does not stick"):
-        rows.slip_um("float64", (0.03,))
 
 
 @pytest.mark.slow
@@ -192,20 +180,6 @@ def test_rows_of_fits_and_of_monte_carlo():
     found = work.function(*work.args)
     assert found["n"] == 64
     assert found["modes"][0]["SEPARATED"] == 0  # the finger touches in every step
-
-
-@pytest.mark.slow
-def test_tiles_change_nothing(monkeypatch):
-    monkeypatch.setattr(cases, "TILE", 16)
-    work = cases.push("float64", 40)
-    assert " while(" in jax.jit(lambda x: cases.in_tiles(lambda x: 2 * x, (x,), 40)).lower(jnp.ones(40)).as_text("hlo")
-    with monkeypatch.context() as elsewhere:
-        elsewhere.setattr(cases, "on_cpu", lambda: False)
-        whole = jax.jit(lambda x: cases.in_tiles(lambda x: 2 * x, (x,), 40)).lower(jnp.ones(40)).as_text("hlo")
-    assert " while(" not in whole
-    tiled = np.asarray(jax.jit(work.function)(*work.args))
-    monkeypatch.setattr(cases, "TILE", 64)
-    np.testing.assert_array_equal(tiled, np.asarray(jax.jit(cases.push("float64", 40).function)(*work.args)))
 
 
 @pytest.mark.slow

@@ -237,7 +237,7 @@ AMONG_FIXTURES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["along a wall", pytest.param("around a peg", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["along a wall", "around a peg"])
 def test_pushes_among_fixtures_agree(name):
     """The poses agree to what a quartic and soft contacts allow; without the fixture they are far apart."""
     (geom, fixture), start, travel = AMONG_FIXTURES[name]

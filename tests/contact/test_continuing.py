@@ -23,7 +23,7 @@ def solved(problem, solver, displacement, guess):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("contacts", "with_derivatives"), [(2, False), pytest.param(4, True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("contacts", "with_derivatives"), [(2, False), (4, True)])
 def test_the_same_motion_or_a_second_one(contacts, with_derivatives):
     """Answer and derivative are those of `Exhaustive`, unless the motion is not unique: whatever the guess is."""
     count = 400

@@ -12,7 +12,6 @@ from recorded import only_problem
 
 from pushjax.datasets import LogError, Recording, Recordings, load_recordings, load_triangle_log
 from pushjax.datasets import triangle as setup
-from pushjax.datasets.triangle import _force_filter
 
 # --- compared with the curated arrays ---
 
@@ -377,10 +376,3 @@ def test_names_tell_the_setup(tmp_path: Path, records: Records, name: str, surfa
         assert (log.support_points.shape, log.support_force.shape) == ((0, 2), (0,))
     elif arrangement is None:
         assert log.support_points is log.support_force is None
-
-
-def test_filter_counts_from_one() -> None:
-    force = np.ones((10, 2))
-    assert _force_filter(force).tolist() == [False] * 2 + [True] * 8
-    force[5] = 0.1
-    assert _force_filter(force)[5:7].tolist() == [False, True]

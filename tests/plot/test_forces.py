@@ -23,22 +23,6 @@ def torque(point, force):
     return np.sum(point[..., 0] * force[..., 1] - point[..., 1] * force[..., 0], axis=-1)
 
 
-def test_forces_of_a_finger_add_up_to_the_wrench():
-    """The first number of a force is along the normal, the second along the normal turned by +90 degrees."""
-    side, length = 0.06, 0.024
-    slider, path = pj.Slider(pj.Polygon.rectangle(side, side), pj.Ellipsoid(jnp.eye(3), length)), (-0.042, 0.012)
-    path = pj.line(path, (-0.007, 0.012), 20)
-    push = pj.rollout(slider, pj.Hand.finger(0.005), path, pose=jnp.array([0.0, 0.0, 0.1]), friction=0.15)
-    found, wrench = plot.contact_forces(push), np.asarray(push.wrench)
-    np.testing.assert_allclose(found.force.sum(axis=1), wrench[:, :2], atol=1e-9)
-    np.testing.assert_allclose(torque(found.point, found.force), wrench[:, 2], atol=1e-9 * length)
-    moving, free = (np.asarray(push.status) == status for status in (pj.Status.MOVING, pj.Status.FREE))
-    assert moving.sum() > 10
-    np.testing.assert_allclose(found.point[moving, 0, 0], -side / 2, atol=1e-6)
-    assert free.any()
-    assert not found.force[free].any()
-
-
 @pytest.mark.parametrize("turned", [0.0, 0.6])
 def test_a_flat_grasp_is_held_evenly(turned):
     """Pads as wide as 20 mm on a longer side: a quarter of the squeeze at each end of either pad, straight inward."""

@@ -302,12 +302,13 @@ INPUTS = 8  # friction; pose; the last configuration, which scales the whole pat
 HAND_DIFFERENCE = 1e-5  # for differences over H, where steps rotate the slider far
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hand", "opening"),
     [
-        pytest.param(Hand.two_fingers(0.005), (0.06, 0.04), marks=pytest.mark.slow),
-        pytest.param(Hand.three_fingers(0.003), (0.05, 0.015), marks=pytest.mark.slow),
-        pytest.param(Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03), marks=pytest.mark.slow),
+        (Hand.two_fingers(0.005), (0.06, 0.04)),
+        (Hand.three_fingers(0.003), (0.05, 0.015)),
+        (Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03)),
     ],
     ids=["two fingers", "three fingers", "jaw"],
 )

@@ -84,7 +84,7 @@ def test_pushes_far_from_fixtures_are_those_without():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_by_a_wall_are_those_of_differences(mode):
     """A slider that is pushed flat along a wall and turns on its corner: by place, direction and friction of a wall."""
     path = straight((TOUCH, 0.012), (TOUCH + 0.02, 0.012))

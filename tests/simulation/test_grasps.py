@@ -277,24 +277,14 @@ def test_gradients_are_finite_at_and_after_a_jam():
     ids=["two fingers", "three fingers", "jaw"],
 )
 def test_laws_of_a_grasp(hand, opening):
-    """Friction only dissipates, nothing penetrates, and the grasp is the same if everything is moved or mirrored."""
+    """Friction only dissipates, and nothing penetrates."""
     slider = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), pj.Ellipsoid(np.eye(3), 0.017))
-    shift, mirror = np.array([0.3, -0.2, 0.7]), np.array([-1.0, 1.0, -1.0])  # x -> -x: symmetry of all
-    path = np.array(pj.line((0.0, 0.0, 0.0, opening), (0.0, 0.0, 0.1, 0.3 * opening), 100))
-    pose = np.array([0.004, 0.002, 0.4])
-    paths = np.stack([path, path, path * np.array([*mirror, 1.0])])
-    paths[1, :, :3] = pj.se2.compose(shift, path[:, :3])
-    poses = np.stack([pose, pj.se2.compose(shift, pose), pose * mirror])
-    runs = (pj.rollout(slider, hand, path, pose=pose, friction=0.2) for path, pose in zip(paths, poses, strict=True))
-    base, moved, mirrored = (jax.tree.map(np.asarray, run) for run in runs)
-    assert np.any(base.status == pj.Status.MOVING)
-    assert base.status[-1] in (pj.Status.GRASPED, pj.Status.JAMMED)
-    np.testing.assert_array_equal(base.status, moved.status)
-    np.testing.assert_array_equal(base.status, mirrored.status)
-    np.testing.assert_allclose(pj.se2.compose(shift, base.pose), moved.pose, atol=1e-9)
-    np.testing.assert_allclose(base.pose * mirror, mirrored.pose, atol=1e-9)
-    assert np.min(np.sum(base.twist * base.wrench, axis=-1)) >= -1e-15
-    assert np.max(base.overlap) < 2e-5
+    path = pj.line((0.0, 0.0, 0.0, opening), (0.0, 0.0, 0.1, 0.3 * opening), 100)
+    grasp = pj.rollout(slider, hand, path, pose=(0.004, 0.002, 0.4), friction=0.2)
+    assert np.any(grasp.status == pj.Status.MOVING)
+    assert grasp.status[-1] in (pj.Status.GRASPED, pj.Status.JAMMED)
+    assert np.min(np.sum(grasp.twist * grasp.wrench, axis=-1)) >= -1e-15
+    assert np.max(grasp.overlap) < 2e-5
 
 
 @pytest.mark.parametrize(

@@ -177,34 +177,6 @@ def test_success_can_be_reached(task, episodes):
         assert abs(observations[0, -1, 4] - 1) < 0.01
 
 
-@pytest.mark.slow  # those of PushT see the same code
-def test_derivatives_are_those_of_differences(episodes):
-    """Of the return in the actions, for a push off the center."""
-    env, params, _, _ = drawn(PushBox)
-    params = without_noise(params)
-    state = at(env, [-0.16, 0.012, -0.1, 0.0, 0.3], params)
-    actions = jnp.tile(jnp.array([0.8, 0.1]), (STEPS, 1)) * (jnp.arange(STEPS) < 12)[:, None]
-    key = jax.random.key(0)
-
-    def value(actions):
-        def step(state, action):
-            _, state, reward, _, _ = env.step_env(key, state, action, params)
-            return state, reward
-
-        return jnp.sum(jax.lax.scan(step, state, actions)[1])
-
-    gradient = jax.jit(jax.grad(value))(actions)
-    assert np.isfinite(gradient).all()
-    directions = jax.random.normal(key, (BATCH // 2, STEPS, 2))
-    size = 1e-5
-    many = actions[None] + size * jnp.concatenate([directions, -directions])
-    _, _, reward, _ = episodes(env, everywhere(state), many, params)
-    ahead, behind = np.split(reward.sum(axis=1), 2)
-    along = np.sum(np.asarray(directions) * np.asarray(gradient)[None], axis=(1, 2))
-    assert np.abs(along).max() > 0.1
-    assert np.allclose((ahead - behind) / (2 * size), along, atol=1e-3 * np.linalg.norm(gradient))
-
-
 def test_reward_has_a_derivative_at_the_goal():
     env = PushBox()
     params = env.default_params
