@@ -92,8 +92,14 @@ def animate(
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         _share_limits(figure, all_axes, panels)
-        held = any(panel.squeeze is not None for panel in panels)
-        _draw_legend(figure, all_axes[0], bool(measured_by_name), largest_force, held)
+        if measured_by_name:
+            all_axes[0].plot([], [], "--", color=RED, lw=1.3, label="measured")
+        if largest_force > 0:
+            label = f"force on the slider, up to {largest_force:.2g} N"
+            all_axes[0].plot([], [], color=ORANGE, lw=2.2, label=label)
+        if any(panel.squeeze is not None for panel in panels):
+            all_axes[0].plot([], [], color=PURPLE, lw=2.2, label=SQUEEZE_LABEL)
+        legend_below(figure, all_axes[0], columns=2 if len(panels) == 1 else 3)
 
     def draw(frame: int) -> None:
         for panel in panels:
@@ -204,14 +210,3 @@ def _set_limits(axes: Axes, points: list[np.ndarray]) -> None:
     low, high = (find(np.concatenate(points), axis=0) for find in (np.nanmin, np.nanmax))
     margin = MARGIN * (high - low).max()
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
-
-
-def _draw_legend(figure: Figure, axes: Axes, show_measured: bool, largest_force: float, held: bool) -> None:
-    """Draw one legend for all panels, with the measured outlines and the squeeze only if there are any."""
-    if largest_force > 0:
-        axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest_force:.2g} N")
-    if held:
-        axes.plot([], [], color=PURPLE, lw=2.2, label=SQUEEZE_LABEL)
-    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
-    shown = {label: handle for label, handle in handles.items() if show_measured or label != "measured"}
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 if len(figure.axes) == 1 else 3)

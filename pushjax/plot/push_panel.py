@@ -76,7 +76,8 @@ class PushPanel:
         (self.slider_line,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
         (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centroid")
         self.finger_lines = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in self.fingers]
-        (self.measured_line,) = axes.plot([], [], "--", color=RED, lw=1.3, label="measured")
+        label = None if self.measured is None else "measured"
+        (self.measured_line,) = axes.plot([], [], "--", color=RED, lw=1.3, label=label)
         (self.contact_dots,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
         zero = np.zeros(self.force.shape[1])
         self.arrows = axes.quiver(zero, zero, zero, zero, color=ORANGE, **ARROWS) if len(zero) else None
