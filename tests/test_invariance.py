@@ -179,8 +179,8 @@ def drawn(kind, seed: int) -> tuple[Scene, np.random.Generator]:
     return scene, rng
 
 
-def each_of(kinds, quick=QUICK):
-    marked = [pytest.param(kind, id="-".join(kind), marks=[pytest.mark.slow] * (kind not in quick)) for kind in kinds]
+def each_of(kinds):
+    marked = [pytest.param(kind, id="-".join(kind), marks=[pytest.mark.slow] * (kind not in QUICK)) for kind in kinds]
     return pytest.mark.parametrize("kind", marked)
 
 
