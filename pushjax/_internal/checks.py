@@ -127,16 +127,12 @@ def check_finite(name: str, value: Any) -> None:
 
 def check_positive(name: str, value: Any) -> None:
     """Raise ValueError if `value` is known and has an entry that is not positive."""
-    known = concrete(value)
-    if known is not None and not np.all(known > 0):
-        raise ValueError(f"{name} must be positive; got {_describe(known)}")
+    _check_sign(name, value, lambda known: known > 0, "must be positive")
 
 
 def check_non_negative(name: str, value: Any) -> None:
     """Raise ValueError if `value` is known and has an entry that is negative or NaN."""
-    known = concrete(value)
-    if known is not None and not np.all(known >= 0):
-        raise ValueError(f"{name} must not be negative; got {_describe(known)}")
+    _check_sign(name, value, lambda known: known >= 0, "must not be negative")
 
 
 def checked_array(
@@ -168,9 +164,12 @@ def checked_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
     return value
 
 
-def _describe(value: np.ndarray) -> str:
-    """Return a number as text, or the range of several numbers, for an error message."""
-    return f"{value.item():.6g}" if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
+def _check_sign(name: str, value: Any, is_right: Callable[[np.ndarray], Any], rule: str) -> None:
+    """Raise ValueError, with the number or the range of the numbers, if `value` is known and breaks a rule."""
+    known = concrete(value)
+    if known is not None and not np.all(is_right(known)):
+        got = f"{known.item():.6g}" if known.size == 1 else f"values from {np.nanmin(known)} to {np.nanmax(known)}"
+        raise ValueError(f"{name} {rule}; got {got}")
 
 
 def traced(tree: Any) -> bool:

@@ -31,7 +31,9 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     current = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     if folder is None and current:
         return Path(current)
-    path = Path(folder).expanduser() if folder is not None else _default_folder()
+    # machines that share a home folder may not be able to run each other's compiled programs
+    default = platformdirs.user_cache_path("pushjax", appauthor=False) / "compiled" / processor()
+    path = default if folder is None else Path(folder).expanduser()
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # small programs too: there are hundreds
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
@@ -50,12 +52,6 @@ def _silence_loader() -> None:
     for logger, level, handlers in loggers:
         logger.setLevel(level)
         logger.handlers[:] = handlers
-
-
-def _default_folder() -> Path:
-    """Return the default folder, one for each kind of processor."""
-    # machines that share a home folder may not be able to run each other's compiled programs
-    return platformdirs.user_cache_path("pushjax", appauthor=False) / "compiled" / processor()
 
 
 def processor() -> str:

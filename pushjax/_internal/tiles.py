@@ -1,14 +1,13 @@
-"""The door from functions of single examples to functions of whole batches, whose arrays have the batch last."""
+"""Batches in tiles, by functions whose arrays have the batch last."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from pushjax._internal.compaction import flat_batch, tile_size
+from pushjax._internal.one_batch import in_one_batch, queued, tile_size, written
 from pushjax._internal.xla import entry_at
 
 # Examples that are computed together on a CPU by a program of many small kernels, most of whose time is that of their
@@ -26,46 +25,15 @@ def in_tiles(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, "
     # The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
     # attempt, or have no first one, are gathered into tiles of their own, which follow. One program serves both. It
     # cannot be differentiated.
-    wanted = jnp.stack([needed & has_first, needed & ~has_first])
-    structure = jax.tree.structure(args)
 
-    # `vmap` asks for a batch several times. As a function of its own, it is traced for the first time only.
-    @partial(jax.jit, static_argnums=0)
-    def of_batch(batched: tuple[bool, ...], wanted: Array, args: Any) -> Any:
-        return _tile_by_tile(attempt, wanted, jax.tree.unflatten(structure, batched), args)
+    def of_batch(batched: Any, wanted: Array, args: Any) -> Any:
+        return _tile_by_tile(attempt, wanted, batched, args)
 
-    @jax.custom_batching.custom_vmap
-    def single(wanted, args):
-        results = of_batch((False,) * structure.num_leaves, wanted[None], args)
-        return entry_at(results, 0)
+    @jax.jit
+    def single(wanted: Array, args: Any) -> Any:
+        return entry_at(of_batch(jax.tree.map(lambda _: False, args), wanted[None], args), 0)
 
-    @single.def_vmap
-    def _(size, batched, wanted, args):
-        wanted = wanted if batched[0] else jnp.broadcast_to(wanted, (size, 2))
-        return _batching_rule(of_batch, size, batched[1], wanted, args)
-
-    return single(wanted, args)
-
-
-def _batching_rule(of_batch: Callable[..., Any], size: int, batched: Any, wanted: Array, args: Any) -> tuple[Any, Any]:
-    """Batching rule of `in_tiles`: the results, and which leaves are batched (all)."""
-
-    @jax.custom_batching.custom_vmap
-    def batch(wanted, args):
-        return of_batch(tuple(jax.tree.leaves(batched)), wanted, args)
-
-    @batch.def_vmap
-    def _(outer_size, outer_batched, wanted, args):
-        flat = partial(flat_batch, size, outer_size)
-        wanted_has_outer, args_have_outer = outer_batched
-        either = jax.tree.map(lambda inner, outer: inner or outer, batched, args_have_outer)
-        flat_args = jax.tree.map(flat, args, batched, args_have_outer)
-        flat_wanted = flat(wanted, True, wanted_has_outer)
-        results, all_batched = _batching_rule(of_batch, outer_size * size, either, flat_wanted, flat_args)
-        return jax.tree.map(lambda x: x.reshape(outer_size, size, *x.shape[1:]), results), all_batched
-
-    results = batch(wanted, args)
-    return results, jax.tree.map(lambda _: True, results)
+    return in_one_batch(single, of_batch, jnp.stack([needed & has_first, needed & ~has_first]), args)
 
 
 def _tile_by_tile(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, args: Any) -> Any:
@@ -91,8 +59,7 @@ def _tile_by_tile(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any,
         rows = jax.lax.dynamic_slice(queue, (k * tile,), (tile,))
         count = jnp.where(again, jnp.sum(rows < size, dtype=jnp.int32), 0)
         new, left = attempt_at(count, jnp.minimum(rows, size - 1))
-        results = jax.tree.map(lambda old, x: old.at[rows].set(x, mode="drop"), results, new)
-        unfinished = unfinished.at[rows].set(left, mode="drop")
+        results, unfinished = written((results, unfinished), rows, (new, left))
         # after the last tile of the first attempt, queue the examples that want a second one
         starts_again = (k + 1 == end) & ~again
         end, queue = jax.lax.cond(starts_again, lambda: _queued(unfinished, tile), lambda: (end, queue))
@@ -107,9 +74,7 @@ def _tile_by_tile(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any,
 
 def _queued(wanted: Bool[Array, " size"], tile: int) -> tuple[Array, Array]:
     """The number of tiles, and the indices of the examples in them, then padding."""
-    size = wanted.shape[0]
-    queue = jnp.nonzero(wanted, size=size + tile, fill_value=size)[0].astype(jnp.int32)
-    return -(-jnp.sum(wanted, dtype=jnp.int32) // tile), queue
+    return -(-jnp.sum(wanted, dtype=jnp.int32) // tile), queued(wanted, tile)
 
 
 def in_search_tiles(search: Callable[[Any], Any], count: Int[Array, ""], problem: Any, blank: Any) -> Any:

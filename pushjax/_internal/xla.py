@@ -94,17 +94,15 @@ def smallest(values: Float[Array, " values"]) -> Scalar:
     return -largest(-values)
 
 
-def structure_and_shapes(tree) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
-    """Return the structure of a pytree of arrays, and the shapes and dtypes of its leaves, both hashable."""
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-
-
 def map_items(function: Callable, items: tuple) -> tuple:
     """Return `(function(item), ...)` for pytrees, in a loop if they have the same structure, shapes and dtypes."""
     # A loop compiles `function` once. Other items are unrolled, which compiles `function` once for every item.
     # Compilation takes most of the time of a first call.
-    if len(items) == 1 or len({structure_and_shapes(item) for item in items}) > 1:
+    kinds = {
+        (jax.tree.structure(item), *((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(item)))
+        for item in items
+    }
+    if len(items) == 1 or len(kinds) > 1:
         return tuple(function(item) for item in items)
     stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
     return tuple(entry_at(stacked, k) for k in range(len(items)))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pushjax._internal.compaction import PLACES, TILE, Rounds, where_needed, where_needed_without_derivatives
+from pushjax._internal.compaction import PLACES, TILE, Rounds, where_needed
 
 
 def work(x, shared):
@@ -14,7 +14,7 @@ def work(x, shared):
 
 def chosen(needed, x, shared):
     otherwise = {"square": x, "sign": jnp.zeros((), jnp.int32)}
-    return where_needed_without_derivatives(needed, work, otherwise, x, shared)
+    return where_needed(needed, work, otherwise, x, shared)
 
 
 each_chosen = jax.jit(jax.vmap(chosen, in_axes=(0, 0, None)))
@@ -90,7 +90,7 @@ def collatz_of(start, limit):
 
 def rounds_of(needed, start, limit):
     otherwise = {"rounds": jnp.zeros((), jnp.int32), "last": start}
-    return where_needed_without_derivatives(needed, collatz, otherwise, start, limit)
+    return where_needed(needed, collatz, otherwise, start, limit, rounds=collatz)
 
 
 each_of_rounds = jax.jit(jax.vmap(rounds_of, in_axes=(0, 0, None)))
