@@ -28,14 +28,13 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._internal.tiles import in_search_tiles, in_tiles
 from pushjax._math.arrays import FULL
 from pushjax._math.linalg import cholesky
-from pushjax.friction.sum_of_squares import MONOMIAL_SUMS
+from pushjax.friction.quartic import TENSORS
 
 # All tables have the entries of N and of S, and the six products v, in the order xx, yy, zz, xy, xz, yz.
 UNITS = (np.arange(6)[:, None, None] == FULL).astype(float)  # the matrix N for each of its entries, (6, 3, 3)
 ALTERNATING = np.cross(np.eye(3)[:, None], np.eye(3))
 # The matrix of <N, adj S> for each entry of N, (6, 6, 6), and that of T(S, S) for each of the 15 coefficients.
 ADJUGATES = np.einsum("eij,ikm,jln,akl,bmn->eab", UNITS, ALTERNATING / 2, ALTERNATING, UNITS, UNITS, optimize=True)
-TENSORS = (MONOMIAL_SUMS / MONOMIAL_SUMS.sum(axis=1, keepdims=True)).reshape(15, 3, 3, 3, 3)
 COEFFICIENTS = np.einsum("cijkl,aij,bkl->cab", TENSORS, UNITS, UNITS)
 # In the norm that does not depend on the frame all of them are orthogonal. So a projection of G gives N.
 PROJECTIONS = ADJUGATES / np.outer(UNITS.sum(axis=(1, 2)), UNITS.sum(axis=(1, 2)))

@@ -32,9 +32,8 @@ from pushjax._internal.checks import (
     ArrayLike,
     as_float,
     check_count,
-    check_finite,
-    check_positive,
     check_shape,
+    checked_array,
     checked_weights,
     common_dtype,
     concrete,
@@ -43,6 +42,7 @@ from pushjax._internal.checks import (
     traced,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax._math.arrays import FULL
 from pushjax._math.vec import Vec3
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.fit_loss import (
@@ -148,18 +148,12 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
             positive; if `terms` is less than one; or if the degree is neither 2 nor 4.
     """
     dtype = common_dtype(wrench, twist, length)
-    wrenches, twists, characteristic_length = (
-        as_float(wrench, dtype, "wrench"),
-        as_float(twist, dtype, "twist"),
-        as_float(length, dtype, "length"),
-    )
-    check_shape("wrench", wrenches, ("pairs", 3))
-    pair_weights = checked_weights(weights, wrenches.shape[0], dtype)
-    _check_arguments(wrenches, twists, characteristic_length, pair_weights, degree)
-    factors = as_float(value_weight, dtype, "value_weight"), as_float(ridge, dtype, "ridge")
-    for name, value in zip(("value_weight", "ridge"), factors, strict=True):
-        check_finite(name, value)
-        check_positive(name, value)
+    wrenches = checked_array("wrench", wrench, ("pairs", 3), dtype)
+    twists = checked_array("twist", twist, (len(wrenches), 3), dtype)
+    pair_weights = checked_weights(weights, len(wrenches), dtype)
+    _check_pairs(wrenches, twists, pair_weights, degree)
+    scalars = {"length": length, "value_weight": value_weight, "ridge": ridge}
+    characteristic_length, *factors = (checked_array(*item, (), dtype, positive=True) for item in scalars.items())
     check_count("terms", terms)
     arrays = [wrenches, twists, characteristic_length, pair_weights, *factors]
     fit = _fit_in_jax if traced(arrays) else _fit_in_numpy
@@ -167,11 +161,8 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     converged = concrete(fit_report.converged)
     if not report and converged is not None and not converged:
         warnings.warn("fit_limit_surface did not converge; see its report", RuntimeWarning, stacklevel=2)
-    surface: LimitSurface
-    if degree == 2:
-        surface = Ellipsoid(_symmetric(coefficients), characteristic_length)
-    else:
-        surface = Quartic(coefficients, characteristic_length)
+    kind, numbers = (Ellipsoid, _symmetric(coefficients)) if degree == 2 else (Quartic, coefficients)
+    surface: LimitSurface = kind(numbers, characteristic_length)
     return (surface, fit_report) if report else surface
 
 
@@ -203,18 +194,13 @@ def mean_twist_angle(surface: LimitSurface, wrench: ArrayLike, twist: ArrayLike)
     return jnp.mean(jax.vmap(angle)(wrenches, twists))
 
 
-def _check_arguments(wrench: Array, twist: Array, length: Array, weights: Array, degree: int) -> None:
-    """Raise ValueError for arguments that `fit_limit_surface` rejects."""
+def _check_pairs(wrench: Array, twist: Array, weights: Array, degree: int) -> None:
+    """Raise ValueError for a degree, or pairs of finite numbers, that `fit_limit_surface` rejects."""
     if degree not in (2, 4):
         raise ValueError(f"degree must be 2 or 4; got {degree}")
-    check_shape("twist", twist, (wrench.shape[0], 3))
-    check_shape("length", length, ())
     needed = 6 if degree == 2 else 15
     if wrench.shape[0] < needed:
         raise ValueError(f"wrench has {wrench.shape[0]} pairs; a surface of degree {degree} needs at least {needed}")
-    for name, value in (("wrench", wrench), ("twist", twist), ("length", length)):
-        check_finite(name, value)
-    check_positive("length", length)
     known, known_weights = concrete(twist), concrete(weights)
     if known is not None and known_weights is not None:
         zero = ~known.any(axis=1) & (known_weights > 0)
@@ -285,16 +271,14 @@ def _fit_in_numpy(*arrays: Array, degree: int, terms: int):
     with np.errstate(all="ignore"):
         found = _fit(np, *(np.asarray(array, np.float64) for array in arrays), degree=degree, terms=terms)
 
-    return jax.tree.map(lambda value: on_device(_as_given(np.asarray(value), dtype)), found)
+    def as_given(value: Any) -> Array:
+        """Return floats in the dtype of the pairs, and other numbers as they are."""
+        return on_device(np.asarray(value, dtype if np.issubdtype(np.asarray(value).dtype, np.floating) else None))
 
-
-def _as_given(value: np.ndarray, dtype: Any) -> np.ndarray:
-    """Return floats in the dtype of the pairs."""
-    return value.astype(dtype) if np.issubdtype(value.dtype, np.floating) else value
+    return jax.tree.map(as_given, found)
 
 
 @in_numpy
 def _symmetric(xp, a: Float[Array, "6"]) -> Float[Array, "3 3"]:
     """Return the matrix A of an ellipsoid, given the coefficients of its monomials."""
-    xy, xz, yz = a[3] / 2, a[4] / 2, a[5] / 2
-    return xp.stack([xp.stack([a[0], xy, xz]), xp.stack([xy, a[1], yz]), xp.stack([xz, yz, a[2]])])
+    return (a / xp.asarray([1, 1, 1, 2, 2, 2], a.dtype))[FULL]

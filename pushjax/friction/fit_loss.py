@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax.friction.quartic import MONOMIALS
-from pushjax.friction.sum_of_squares import LOWER_ENTRIES, MONOMIAL_SUMS, monomial_sums
+from pushjax._math.arrays import ENTRIES
+from pushjax.friction.quartic import MONOMIAL_SUMS, MONOMIALS, monomial_sums
+from pushjax.friction.sum_of_squares import LOWER_ENTRIES
 
 MAX_STEPS = 500  # of the optimizer, in each round
 # Of the optimizer in NumPy, for a loss of order one: the gradient at which it stops; and the largest decrease of the
@@ -23,7 +24,7 @@ GRADIENT_TOLERANCE, LARGEST_DECREASE = 1e-9, 1e-10
 LEAST_EIGENVALUE = 1e-4
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
-QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
+QUADRATIC_MONOMIALS = np.stack([np.bincount(entry, minlength=3) for entry in ENTRIES])
 QUADRATIC_SUMS = monomial_sums(QUADRATIC_MONOMIALS)
 
 

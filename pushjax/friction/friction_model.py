@@ -5,12 +5,12 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import (
     ArrayLike,
     as_float,
+    check_count,
     check_finite,
     check_non_negative,
     common_dtype,
@@ -74,10 +74,8 @@ class FrictionModel(eqx.Module):
         dtype = common_dtype(dof, friction)
         if sampler not in ("gram", "sum_of_squares"):
             raise ValueError(f"sampler must be 'gram' or 'sum_of_squares'; got {sampler!r}")
-        if resample_every is not None and (not isinstance(resample_every, (int, np.integer)) or resample_every < 1):
-            raise ValueError(
-                f"resample_every must be a whole number of steps, at least 1, or None; got {resample_every!r}"
-            )
+        if resample_every is not None:
+            check_count("resample_every", resample_every)
         self.sampler, self.resample_every = sampler, None if resample_every is None else int(resample_every)
         self.dof = None
         if dof is not None:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, concrete
+from pushjax._internal.checks import ArrayLike, checked_array, concrete
 from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._math.arrays import cross, dot
 from pushjax._math.linalg import Symmetric3
@@ -55,10 +55,6 @@ class Form(Protocol):
     def value(self, f: Vec3) -> Scalar: ...
 
     def gradient(self, f: Vec3) -> Vec3: ...
-
-    def spin(self, f: Vec3) -> Scalar:
-        """Return the third component of the gradient, which is proportional to the angular velocity."""
-        ...
 
     def hessian(self, f: Vec3) -> Symmetric3: ...
 
@@ -121,6 +117,9 @@ class LimitSurface(eqx.Module):
         """Return whether H is convex, up to roundoff. The surface must not be traced."""
 
     @abstractmethod
+    def _aligned_wrench(self, v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
+        """Return a normalized wrench of any scale whose twist is `v`, of norm one, and the number of Newton rounds."""
+
     def inverse(self, twist: ArrayLike) -> InverseMap:
         """Find the wrench on H = 1 whose twist has the direction of `twist`.
 
@@ -135,12 +134,32 @@ class LimitSurface(eqx.Module):
         Raises:
             ValueError: If the twist has another shape, or is known and zero or not finite.
         """
+        given = checked_array("twist", twist, (3,), self.length.dtype)
+        known = concrete(given)
+        if known is not None and not known.any():
+            raise ValueError("twist is zero: every wrench inside the limit surface has it, none is singled out")
+        normalized = jnp.stack([given[0], given[1], given[2] * self.length])
+        size = jnp.max(jnp.abs(normalized))  # scale to order one first, so that squares neither underflow nor overflow
+        usable = jnp.isfinite(size) & (size > 0)
+        # otherwise +x, to avoid NaN downstream
+        normalized = jnp.where(
+            usable, normalized / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], normalized.dtype)
+        )
+        v = Vec3.of(normalized / jnp.sqrt(jnp.sum(normalized * normalized)))
+        form = self.form()
+        f, rounds = self._aligned_wrench(v)
+        h = form.value(f)
+        angle = angle_between(form.gradient(f), v)
+        # some 1e-3 rad in float32 and 1e-12 rad in float64
+        converged = usable & (h > 0) & (angle <= 1e4 * float(jnp.finfo(angle.dtype).eps))
+        positive = jnp.where(converged, h, 1.0)
+        scale = jnp.where(converged, 1 / jnp.sqrt(positive) if self.degree == 2 else positive**-0.25, 0.0)
+        wrench = jnp.where(converged, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
+        return InverseMap(wrench, converged, rounds, angle)
 
     def _normalized_wrench(self, wrench: ArrayLike) -> Vec3:
         """Return (fx, fy, tau / length), N; raise ValueError unless `wrench` has shape (3,) and is finite."""
-        w = as_float(wrench, self.length.dtype, "wrench")
-        check_shape("wrench", w, (3,))
-        check_finite("wrench", w)
+        w = checked_array("wrench", wrench, (3,), self.length.dtype)
         return Vec3(w[0], w[1], w[2] / self.length)
 
     def value(self, wrench: ArrayLike) -> Float[Array, ""]:
@@ -215,8 +234,7 @@ class LimitSurface(eqx.Module):
         Raises:
             ValueError: If the wrench has another shape, or is known and not finite.
         """
-        w = as_float(wrench, self.length.dtype, "wrench")
-        check_shape("wrench", w, (3,))
+        w = checked_array("wrench", wrench, (3,), self.length.dtype)
         # Scale the wrench to order one first, because powers of a small wrench underflow. Neither the result nor its
         # derivative depends on this scale.
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.stack([w[0], w[1], w[2] / self.length]))))
@@ -252,23 +270,6 @@ class LimitSurface(eqx.Module):
             raise ValueError(f"{path} holds a {type(surface).__name__}, not a {cls.__name__}")
         return surface
 
-    def _normalized_twist(self, twist: ArrayLike) -> tuple[Vec3, Array]:
-        """Return the twist, normalized and scaled to norm one, and whether it is finite and not zero."""
-        v = as_float(twist, self.length.dtype, "twist")
-        check_shape("twist", v, (3,))
-        check_finite("twist", v)
-        known = concrete(v)
-        if known is not None and not known.any():
-            raise ValueError("twist is zero: every wrench inside the limit surface has it, none is singled out")
-        normalized = jnp.stack([v[0], v[1], v[2] * self.length])
-        size = jnp.max(jnp.abs(normalized))  # scale to order one first, so that squares neither underflow nor overflow
-        usable = jnp.isfinite(size) & (size > 0)
-        # otherwise +x, to avoid NaN downstream
-        normalized = jnp.where(
-            usable, normalized / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], normalized.dtype)
-        )
-        return Vec3.of(normalized / jnp.sqrt(jnp.sum(normalized * normalized))), usable
-
 
 def _surface_from_record(record: dict[str, Any], dtype: Any) -> LimitSurface:
     """Return the limit surface that the record of a JSON file describes."""
@@ -278,28 +279,10 @@ def _surface_from_record(record: dict[str, Any], dtype: Any) -> LimitSurface:
     return kind(**{field.name: jnp.asarray(record[field.name], dtype) for field in fields(kind)})
 
 
-def checked_length(length: ArrayLike, dtype) -> Float[Array, ""]:
-    """Return `length` as a scalar array, or raise ValueError unless it is finite and positive."""
-    value = as_float(length, dtype, "length")
-    check_shape("length", value, ())
-    check_finite("length", value)
-    check_positive("length", value)
-    return value
-
-
 def angle_between(a: Vec3, b: Vec3, xp: Any = jnp) -> Scalar:
     """Return the angle between two vectors, rad, also accurate if small; zero if a vector is zero."""
-    sine, cosine = norm(a.cross(b), xp), a.dot(b)
+    cross, cosine = a.cross(b), a.dot(b)
+    squared = cross.dot(cross)
+    sine = xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, 1.0)), 0.0)  # also differentiable at zero
     # arctan2(0, 0) is zero, but its derivative is NaN
     return xp.arctan2(sine, xp.where((sine == 0) & (cosine == 0), 1.0, cosine))
-
-
-def angle_tolerance(angle: Scalar) -> float:
-    """Return the largest angle, rad, of a converged inverse map: some 1e-3 in float32 and 1e-12 in float64."""
-    return 1e4 * float(jnp.finfo(angle.dtype).eps)
-
-
-def norm(a: Vec3, xp: Any = jnp) -> Scalar:
-    """Return the Euclidean norm; its derivative at the zero vector is zero."""
-    squared = a.dot(a)
-    return xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, 1.0)), 0.0)

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete
+from pushjax._internal.checks import ArrayLike, checked_array, concrete
 from pushjax._internal.xla import compute_once
 from pushjax._math.arrays import ENTRIES
 from pushjax._math.directions import fibonacci_hemisphere
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3, unstack
-from pushjax.friction.limit_surface import InverseMap, LimitSurface, angle_between, angle_tolerance, checked_length
+from pushjax.friction.limit_surface import LimitSurface
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients.
 MONOMIALS = np.array(
@@ -32,6 +32,20 @@ HESSIAN_TERMS = [
     ]
     for i, j in ENTRIES
 ]
+
+
+def monomial_sums(monomials: np.ndarray) -> np.ndarray:
+    """Return the matrix (m, 3^d) that sums a flattened array of factors of F_i F_j ... to coefficients of a form."""
+    # `monomials` are the exponents of the m monomials of degree d, (m, 3)
+    degree = int(monomials[0].sum())
+    indices = np.indices((3,) * degree).reshape(degree, -1)
+    exponents = (indices == np.arange(3)[:, None, None]).sum(axis=1)
+    return (monomials[:, :, None] == exponents[None]).all(axis=1).astype(float)
+
+
+MONOMIAL_SUMS = monomial_sums(MONOMIALS)
+# The symmetric tensors of the monomials: m_k(F) = T_k(F, F, F, F).
+TENSORS = (MONOMIAL_SUMS / MONOMIAL_SUMS.sum(axis=1, keepdims=True)).reshape(15, 3, 3, 3, 3)
 
 # How far below zero the smallest curvature may be, relative to the largest. A fitted surface may lie on the border of
 # convexity, where roundoff can make its smallest curvature negative. Coefficients stored in float32 are themselves only
@@ -68,16 +82,12 @@ class QuarticForm(NamedTuple):
             + xx * (c[3] * x + c[12] * z)
             + zz * (c[8] * z + c[14] * x)
         )
-        return Vec3(gx, gy, self.spin(f))
-
-    def spin(self, f: Vec3) -> Scalar:
-        c, (x, y, z) = self.c, f
-        xx, yy, zz = x * x, y * y, z * z
-        return (
+        gz = (
             z * (4 * c[2] * zz + 3 * z * (c[7] * x + c[8] * y) + 2 * (c[10] * xx + c[11] * yy + c[14] * x * y))
             + xx * (c[4] * x + c[12] * y)
             + yy * (c[6] * y + c[13] * x)
         )
+        return Vec3(gx, gy, gz)
 
     def hessian(self, f: Vec3) -> Symmetric3:
         c, (x, y, z) = self.c, f
@@ -156,9 +166,7 @@ class Quartic(LimitSurface):
     degree: ClassVar[int] = 4
 
     def __init__(self, coefficients: ArrayLike, length: ArrayLike):
-        array = as_float(coefficients, name="coefficients")
-        check_shape("coefficients", array, (15,))
-        check_finite("coefficients", array)
+        array = checked_array("coefficients", coefficients, (15,))
         known = concrete(array)
         if known is not None:
             if not known.any():
@@ -170,7 +178,7 @@ class Quartic(LimitSurface):
                     f"unit sphere is {curvature:.3g} of its largest"
                 )
         self.coefficients = array
-        self.length = checked_length(length, array.dtype)
+        self.length = checked_array("length", length, (), array.dtype, positive=True)
 
     def form(self) -> QuarticForm:
         return QuarticForm(unstack(self.coefficients), self.length)
@@ -178,22 +186,13 @@ class Quartic(LimitSurface):
     def is_convex(self) -> bool:
         return least_curvature(np.asarray(self.coefficients)) >= -CONVEXITY_TOLERANCE
 
-    def inverse(self, twist: ArrayLike) -> InverseMap:
-        """Solve grad H(F) = v by a safeguarded Newton's method; see `LimitSurface.inverse`."""
-        v, usable = self._normalized_twist(twist)
-        form = self.form()
-        f, rounds = _inverse(form.c, v)
-        h = form.value(f)
-        angle = angle_between(form.gradient(f), v)
-        converged = usable & (h > 0) & (angle <= angle_tolerance(angle))
-        scale = jnp.where(converged, jnp.where(converged, h, 1.0) ** -0.25, 0.0)
-        wrench = jnp.where(converged, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
-        return InverseMap(wrench, converged, rounds, angle)
+    def _aligned_wrench(self, v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
+        return _inverse(self.form().c, v)
 
 
 @jax.custom_jvp
 def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
-    """Return F with grad H(F) = v, and the number of Newton rounds, for the 15 coefficients c."""
+    """Solve grad H(F) = v by a safeguarded Newton's method: return F, and the number of rounds."""
     form = QuarticForm(c, jnp.ones_like(v.x))
 
     def rescaled(f: Vec3) -> Vec3:
@@ -256,7 +255,7 @@ def least_curvature(coefficients: np.ndarray) -> float:
     # z' hess H(F) z is 12 times a symmetric form T(F, F, z, z). The search starts at the directions F with the smallest
     # eigenvalues out of 2000 that cover the half sphere. z becomes the eigenvector of the smallest eigenvalue of the
     # Hessian at F, then F becomes the one of the Hessian at z. Each half step can only lower the eigenvalue.
-    tensor = _curvature_tensor(np.asarray(coefficients, np.float64))
+    tensor = np.tensordot(np.asarray(coefficients, np.float64), 12 * TENSORS, 1)
     direction = fibonacci_hemisphere(2000)
     values, vectors = np.linalg.eigh(np.einsum("ijkl,nk,nl->nij", tensor, direction, direction))
     worst = np.argsort(values[:, 0])[:32]
@@ -265,14 +264,3 @@ def least_curvature(coefficients: np.ndarray) -> float:
         found, vector = np.linalg.eigh(np.einsum("ijkl,nk,nl->nij", tensor, z, z))
         lowest, z = np.minimum(lowest, found[:, 0]), vector[:, :, 0]
     return float(lowest.min() / max(np.abs(values).max(), np.finfo(float).tiny))
-
-
-def _curvature_tensor(coefficients: np.ndarray) -> np.ndarray:
-    """Return the fully symmetric tensor 12 T with hess H(F)[i, j] = sum_kl 12 T[i, j, k, l] F_k F_l."""
-    tensor = np.zeros((3, 3, 3, 3))
-    for index in np.ndindex(3, 3, 3, 3):
-        exponent = np.bincount(index, minlength=3)
-        k = int(np.argmax((MONOMIALS == exponent).all(axis=1)))
-        permutations = 24 / np.prod([[1, 1, 2, 6, 24][e] for e in exponent])
-        tensor[index] = 12 * coefficients[k] / permutations
-    return tensor

@@ -13,27 +13,13 @@ from jaxtyping import Array, Float
 
 from pushjax._internal.autodiff import without_derivatives
 from pushjax._math.directions import fibonacci_hemisphere
-from pushjax.friction.quartic import MONOMIALS
+from pushjax.friction.quartic import MONOMIAL_SUMS
 
 # With this many terms, a fit is close to the optimum over all convex quartics. `pushjax.friction.fit` says how close.
 TERMS = 5
 MAX_STEPS = 100  # of the Levenberg-Marquardt method
 _LOWER_INDICES = np.array(np.tril_indices(3), np.int32)
 LOWER_ENTRIES = np.eye(9)[np.flatnonzero(np.tril(np.ones((3, 3))))]  # (6, 9), from a lower triangle to a matrix
-
-
-def monomial_sums(monomials: np.ndarray) -> np.ndarray:
-    """Return the matrix (m, 3^d) that sums a flattened array of factors of F_i F_j ... to coefficients of a form."""
-    # `monomials` are the exponents of the m monomials of degree d, (m, 3)
-    degree = int(monomials[0].sum())
-    sums = np.zeros((len(monomials), 3**degree))
-    for flat, index in enumerate(np.ndindex(*(3,) * degree)):
-        exponent = np.bincount(index, minlength=3)
-        sums[int(np.argmax((monomials == exponent).all(axis=1))), flat] = 1
-    return sums
-
-
-MONOMIAL_SUMS = monomial_sums(MONOMIALS)
 
 
 def squared_quadratics(p: Float[Array, "terms 3 3"]) -> Float[Array, "15"]:
@@ -80,7 +66,7 @@ def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> SumOfSqua
     start = jnp.asarray(initial_factors(4, terms, coefficients.dtype))
     factors = without_derivatives(_search_factors, target, start)
     # many changes of the L_k meet a change of the coefficients; the derivative is the smallest
-    jacobian = jax.lax.stop_gradient(jax.jacobian(_coefficients)(factors).reshape(len(MONOMIALS), -1))
+    jacobian = jax.lax.stop_gradient(jax.jacobian(_coefficients)(factors).reshape(target.size, -1))
     change = target - jax.lax.stop_gradient(target)
     factors = factors + (jnp.linalg.pinv(jacobian) @ change).reshape(factors.shape)
     return SumOfSquares(unpack_lower(factors) * scale**0.25, jnp.max(jnp.abs(_coefficients(factors) - target)))

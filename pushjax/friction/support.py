@@ -19,12 +19,8 @@ from jaxtyping import Array, Float, Key
 
 from pushjax._internal.checks import (
     ArrayLike,
-    as_float,
     check_count,
-    check_finite,
-    check_non_negative,
-    check_positive,
-    check_shape,
+    checked_array,
     checked_weights,
     common_dtype,
     concrete,
@@ -65,12 +61,8 @@ class Support(eqx.Module):
 
     def __init__(self, point: ArrayLike, limit: ArrayLike):
         dtype = common_dtype(point, limit)
-        self.point, self.limit = as_float(point, dtype, "point"), as_float(limit, dtype, "limit")
-        check_shape("point", self.point, ("points", 2))
-        check_shape("limit", self.limit, (self.point.shape[0],))
-        check_finite("point", self.point)
-        check_finite("limit", self.limit)
-        check_non_negative("limit", self.limit)
+        self.point = checked_array("point", point, ("points", 2), dtype)
+        self.limit = checked_array("limit", limit, (len(self.point),), dtype, non_negative=True)
         known = concrete(self.limit)
         if known is not None and not known.sum() > 0:
             raise ValueError("limit: at least one support point must carry a load; all are zero")
@@ -92,13 +84,10 @@ class Support(eqx.Module):
                 load is not positive.
         """
         dtype = common_dtype(point, weights, load)
-        array, total = as_float(point, dtype, "point"), as_float(load, dtype, "load")
-        check_shape("point", array, ("points", 2))
-        relative = checked_weights(weights, array.shape[0], dtype)
-        check_shape("load", total, ())
-        check_finite("load", total)
-        check_positive("load", total)
-        return Support(array, in_numpy(_distribute)(total, relative))
+        array = checked_array("point", point, ("points", 2), dtype)
+        relative = checked_weights(weights, len(array), dtype)
+        total = checked_array("load", load, (), dtype, positive=True)
+        return Support(array, in_numpy(lambda xp, total, share: total * share / xp.sum(share))(total, relative))
 
     @staticmethod
     def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
@@ -118,16 +107,10 @@ class Support(eqx.Module):
                 only shapes are checked.
         """
         dtype = common_dtype(point, load, center)
-        array, center_point = as_float(point, dtype, "point"), as_float(center, dtype, "center")
-        check_shape("point", array, (3, 2))
-        check_shape("center", center_point, (2,))
-        check_finite("point", array)
-        check_finite("center", center_point)
+        array = checked_array("point", point, (3, 2), dtype)
+        center_point = checked_array("center", center, (2,), dtype)
         # The share of a point is proportional to the area of the triangle of the center and the other two points.
-        to_next, to_previous = (
-            jnp.roll(array, -1, axis=0) - center_point[None],
-            jnp.roll(array, -2, axis=0) - center_point[None],
-        )
+        to_next, to_previous = (jnp.roll(array, -k, axis=0) - center_point[None] for k in (1, 2))
         double_area = to_next[:, 0] * to_previous[:, 1] - to_next[:, 1] * to_previous[:, 0]
         total = jnp.sum(double_area)
         known = concrete(total)
@@ -214,9 +197,7 @@ class Support(eqx.Module):
         Raises:
             ValueError: If the twist has the wrong shape or is not finite.
         """
-        v = as_float(twist, self.point.dtype, "twist")
-        check_shape("twist", v, (3,))
-        check_finite("twist", v)
+        v = checked_array("twist", twist, (3,), self.point.dtype)
         in_disk = jnp.zeros_like(self.point)
         if key is not None:
             in_disk = in_unit_disk(jnp, draw_uniform(key, len(self.point), v.dtype))
@@ -243,22 +224,11 @@ class Support(eqx.Module):
             ValueError: If `pairs` is less than one, or the length is not positive.
         """
         check_count("pairs", pairs)
-        characteristic_length = (
-            in_numpy(_characteristic_length)(self.point, self.limit)
-            if length is None
-            else as_float(length, self.point.dtype, "length")
-        )
-        check_shape("length", characteristic_length, ())
-        check_finite("length", characteristic_length)
-        check_positive("length", characteristic_length)
+        given = in_numpy(_characteristic_length)(self.point, self.limit) if length is None else length
+        checked_length = checked_array("length", given, (), self.point.dtype, positive=True)
         draws = draw(key, self.point, self.limit, pairs)
-        wrench, twist = pairs_of(self.point, self.limit, characteristic_length, *draws)
-        return WrenchTwistPairs(wrench, twist, characteristic_length)
-
-
-def _distribute(xp, total, weights):
-    """Return the friction limit of each point, N, for a total limit and relative weights."""
-    return total * weights / xp.sum(weights)
+        wrench, twist = pairs_of(self.point, self.limit, checked_length, *draws)
+        return WrenchTwistPairs(wrench, twist, checked_length)
 
 
 def _center(xp, point, limit):

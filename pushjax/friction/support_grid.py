@@ -43,19 +43,17 @@ def covered_cells(shape: Shape, points: int) -> tuple[np.ndarray, np.ndarray]:
     most = max(len(centers) for centers, _ in grids)  # pad all to one length, to compile once
     # samples nearer to the outline than this count half, because roundoff would decide whether they are inside
     tolerance = 64 * np.finfo(dtype).eps * max(np.abs(low).max(), np.abs(high).max())
-    best: tuple[np.ndarray, np.ndarray] | None = None
+    found = []
     for centers, cell in grids:
         samples = _samples(centers, cell)
         padded = np.concatenate([samples, np.broadcast_to(low, ((most - len(centers)) * SAMPLES**2, 2))])
         distance = _distances(shape, padded.astype(dtype))[: len(samples)]
         inside = np.where(distance < -tolerance, 1.0, np.where(distance <= tolerance, 0.5, 0.0))
-        found = _covered_parts(samples, centers, inside)
-        if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
-            best = found
-        if len(best[0]) == points:
+        found.append(_covered_parts(samples, centers, inside))
+        if len(found[-1][0]) == points:
             break
-    assert best is not None
-    return best[0].astype(dtype), best[1].astype(dtype)
+    best_centers, areas = min(found, key=lambda parts: abs(len(parts[0]) - points))
+    return best_centers.astype(dtype), areas.astype(dtype)
 
 
 def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
@@ -77,11 +75,8 @@ def _covered_parts(samples: np.ndarray, centers: np.ndarray, inside: np.ndarray)
     """Return, for each cell with a sample inside, the mean of its inside samples and the fraction of it inside."""
     inside = inside.reshape(len(centers), -1)
     fraction = inside.mean(axis=1)
-    mean = (
-        np.sum(samples.reshape(*inside.shape, 2) * inside[..., None], axis=1)
-        / np.maximum(inside.sum(axis=1), 0.5)[:, None]
-    )
-    mean = np.where((fraction == 1)[:, None], centers, mean)
+    total = np.sum(samples.reshape(*inside.shape, 2) * inside[..., None], axis=1)
+    mean = np.where((fraction == 1)[:, None], centers, total / np.maximum(inside.sum(axis=1), 0.5)[:, None])
     return mean[fraction > 0], fraction[fraction > 0]
 
 

@@ -31,7 +31,7 @@ Zhou et al. 2017 (section V) leave three choices open, which are made as follows
 """
 
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -83,9 +83,9 @@ class SurfaceDistribution(eqx.Module):
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         """Sample one surface. Use `vmap` over keys for a batch."""
 
-    @abstractmethod
-    def with_dof(self, dof: Array) -> "SurfaceDistribution":
+    def with_dof(self, dof: Array) -> Self:
         """Return the same distribution with other degrees of freedom, without repeating the precomputation."""
+        return eqx.tree_at(lambda s: s.dof, self, dof)
 
 
 class Deterministic(SurfaceDistribution):
@@ -96,7 +96,7 @@ class Deterministic(SurfaceDistribution):
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         return SurfaceSample(self.mean, jnp.zeros_like(self.mean.length))
 
-    def with_dof(self, dof: Array) -> "Deterministic":
+    def with_dof(self, dof: Array) -> Self:
         return self
 
 
@@ -116,9 +116,6 @@ class WishartEllipsoid(SurfaceDistribution):
                 "surface: A is singular up to roundoff, so no surfaces can be sampled around it; use float64"
             )
         return WishartEllipsoid(mean, found.lower(), dof)  # NaN for a traced singular A
-
-    def with_dof(self, dof: Array) -> "WishartEllipsoid":
-        return eqx.tree_at(lambda s: s.dof, self, dof)
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         surface = eqx.tree_at(lambda s: s.A, self.mean, sample_wishart(key, self.factor, self.dof))
@@ -152,9 +149,6 @@ class GramQuartic(SurfaceDistribution):
         reference = gram.plus(jnp.maximum(-6 * loading, 0), Gram.ball(dof.dtype))
         # NaN for a traced mean that has no Gram matrix, up to any loading
         return GramQuartic(mean, reference, loading, cholesky(gram.plus(-loading, identity).symmetric).lower(), dof)
-
-    def with_dof(self, dof: Array) -> "GramQuartic":
-        return eqx.tree_at(lambda s: s.dof, self, dof)
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         drawn = sample_wishart(key, self.factor, self.dof) + self.loading * Gram.identity(self.dof.dtype).symmetric
@@ -196,12 +190,19 @@ class SumOfSquaresQuartic(SurfaceDistribution):
     term_dof: Float[Array, ""]
 
     @staticmethod
-    def of(mean: Quartic, dof: Array) -> "SumOfSquaresQuartic":
-        """Return the distribution around a mean, with n = `dof` degrees of freedom.
+    def of(mean: Quartic, dof: Array, factors: Array | None = None) -> "SumOfSquaresQuartic":
+        """Return the distribution around a mean.
+
+        Args:
+            mean: The mean surface.
+            dof: Degrees of freedom n: the relative variance of H, averaged over rays, is 2 / n.
+            factors: Lower triangular factors of the P_k of the mean, shape (terms, 3, 3), where they are known.
 
         Raises:
             ValueError: If the mean is not a sum of five squared quadratic forms. Not checked for traced values.
         """
+        if factors is not None:
+            return SumOfSquaresQuartic(mean, factors, dof_of_terms(factors, dof))
         terms = quick_jit(decompose)(mean.coefficients)
         error = concrete(terms.error)
         if error is not None and not error < DECOMPOSITION_TOLERANCE:
@@ -211,18 +212,7 @@ class SumOfSquaresQuartic(SurfaceDistribution):
             )
         return SumOfSquaresQuartic(mean, terms.lower, dof_of_terms(terms.lower, dof))
 
-    @staticmethod
-    def of_terms(mean: Quartic, factors: Array, dof: Array) -> "SumOfSquaresQuartic":
-        """Return the distribution around a mean whose factors are known.
-
-        Args:
-            mean: The mean surface.
-            factors: Lower triangular factors of the P_k of the mean, shape (terms, 3, 3).
-            dof: Degrees of freedom n: the relative variance of H, averaged over rays, is 2 / n.
-        """
-        return SumOfSquaresQuartic(mean, factors, dof_of_terms(factors, dof))
-
-    def with_dof(self, dof: Array) -> "SumOfSquaresQuartic":
+    def with_dof(self, dof: Array) -> Self:
         return eqx.tree_at(lambda s: s.term_dof, self, dof_of_terms(self.factors, dof))
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:

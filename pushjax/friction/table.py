@@ -10,14 +10,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype
 from pushjax._math.arrays import ENTRIES
 from pushjax._math.linalg import Symmetric3
-from pushjax._math.vec import Scalar, Vec3, cos_sin, unstack
+from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin, unstack
 from pushjax.friction.limit_surface import Form
 
-# Number of entries of each attribute of `Table`.
-SIZES = {"anisotropy": 2, "log_gradient": 2, "log_hessian": 3, "origin": 2}
 # Numbers that are larger have no valid steps: their exponential and their fourth power cannot be computed with.
 MAX_ANISOTROPY, MAX_NUMBER = 20.0, 1e9
 NEAR_ZERO = 1e-3  # squared norm r^2 of the anisotropy below which series give cosh(r) and sinh(r) / r, without 0 / 0
@@ -34,19 +32,14 @@ class WrenchTransform(NamedTuple):
 
     def times(self, f: Vec3) -> Vec3:
         """Return T f."""
-        return Vec3(
-            self.xx * f.x + self.xy * f.y,
-            self.xy * f.x + self.yy * f.y,
-            f.z - self.cx * f.y + self.cy * f.x,
-        )
+        torque = f.z - self.cx * f.y + self.cy * f.x
+        return Vec3(self.xx * f.x + self.xy * f.y, self.xy * f.x + self.yy * f.y, torque)
 
     def transposed(self, g: Vec3) -> Vec3:
         """Return T' g."""
-        return Vec3(
-            self.xx * g.x + self.xy * g.y + self.cy * g.z,
-            self.xy * g.x + self.yy * g.y - self.cx * g.z,
-            g.z,
-        )
+        x = self.xx * g.x + self.xy * g.y + self.cy * g.z
+        y = self.xy * g.x + self.yy * g.y - self.cx * g.z
+        return Vec3(x, y, g.z)
 
 
 class TransformedForm(NamedTuple):
@@ -74,9 +67,6 @@ class TransformedForm(NamedTuple):
 
     def gradient(self, f: Vec3) -> Vec3:
         return self.transform.transposed(self.base.gradient(self.transform.times(f)))
-
-    def spin(self, f: Vec3) -> Scalar:
-        return self.base.spin(self.transform.times(f))
 
     def hessian(self, f: Vec3) -> Symmetric3:
         base, t = self.base.hessian(self.transform.times(f)), self.transform
@@ -140,13 +130,11 @@ class Table(eqx.Module):
         log_hessian: ArrayLike = (0.0, 0.0, 0.0),
         origin: ArrayLike = (0.0, 0.0),
     ):
-        given = {"anisotropy": anisotropy, "log_gradient": log_gradient, "log_hessian": log_hessian, "origin": origin}
-        dtype = common_dtype(*given.values())
-        for name, value in given.items():
-            array = as_float(value, dtype, name)
-            check_shape(name, array, (SIZES[name],))
-            check_finite(name, array)
-            setattr(self, name, array)
+        dtype = common_dtype(anisotropy, log_gradient, log_hessian, origin)
+        self.anisotropy = checked_array("anisotropy", anisotropy, (2,), dtype)
+        self.log_gradient = checked_array("log_gradient", log_gradient, (2,), dtype)
+        self.log_hessian = checked_array("log_hessian", log_hessian, (3,), dtype)
+        self.origin = checked_array("origin", origin, (2,), dtype)
 
     def is_valid(self) -> Bool[Array, ""]:
         """Return whether numbers that were traced when the table was made can be computed with."""
@@ -169,12 +157,8 @@ class Table(eqx.Module):
         hessian_xx, hessian_yy, hessian_xy = unstack(self.log_hessian)
         origin_x, origin_y = unstack(self.origin)
         x, y = pose.x - origin_x, pose.y - origin_y
-        slope_x, slope_y = gradient_x + hessian_xx * x + hessian_xy * y, gradient_y + hessian_xy * x + hessian_yy * y
-        half_length = length / 2  # length^2 / 2, divided by the length, because c is normalized
-        cx, cy = (
-            half_length * (heading.x * slope_x + heading.y * slope_y),
-            half_length * (heading.x * slope_y - heading.y * slope_x),
-        )
+        slope = Vec2(gradient_x + hessian_xx * x + hessian_xy * y, gradient_y + hessian_xy * x + hessian_yy * y)
+        c = slope.unrotate(heading).scale(length / 2)  # length^2 / 2, divided by the length, because c is normalized
         # S = exp(-M) for the symmetric matrix M = [[a, b], [b, -a]] of the anisotropy in the body frame, and
         # exp(-M) = cosh(r) I - sinh(r) / r M with r^2 = a^2 + b^2. Where friction is higher along x, S shrinks fx.
-        return WrenchTransform(cosh_r - sinh_r_by_r * a, cosh_r + sinh_r_by_r * a, -sinh_r_by_r * b, cx, cy)
+        return WrenchTransform(cosh_r - sinh_r_by_r * a, cosh_r + sinh_r_by_r * a, -sinh_r_by_r * b, *c)

@@ -91,7 +91,7 @@ class PredictiveModel(eqx.Module):
         def around(surface, factors) -> SurfaceDistribution:
             # the search for the factors of the sum of squares can be skipped, because they are known
             if sampler == "sum_of_squares" and isinstance(surface, Quartic):
-                return SumOfSquaresQuartic.of_terms(surface, factors, dof)
+                return SumOfSquaresQuartic.of(surface, dof, factors)
             return model.around(surface)
 
         conditions = range(len(parameters.friction))
