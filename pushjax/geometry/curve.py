@@ -12,7 +12,7 @@ from pushjax._internal.checks import ArrayLike, checked_array, concrete, in_nump
 from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import compute_once, entry_at
 from pushjax._math.vec import Vec2
-from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection, signed_area
+from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection, gauss_legendre, signed_area
 from pushjax.geometry.spline import SAMPLES, SplineOutline, spline_segments
 
 # Intervals per segment over which the arc length is integrated. The speed is smooth within an interval.
@@ -121,12 +121,9 @@ class Curve(Shape):
         # The derivatives dx and dy are by the segment's parameter.
         # Relative points keep a curve far from the origin from losing digits.
         segments = jax.tree.map(lambda field: field[:, None], spline_segments(self.control - self.control[:1]))
-        # Five nodes per segment are exact for integrands up to degree nine.
-        nodes, weights = (
-            jnp.asarray(part / 2, self.control.dtype)[None] for part in np.polynomial.legendre.leggauss(5)
-        )
-        point, velocity, _ = segments.evaluate(nodes + 0.5)
-        return *point, *velocity, weights
+        nodes, weights = gauss_legendre(self.control.dtype)
+        point, velocity, _ = segments.evaluate(nodes[None])
+        return *point, *velocity, weights[None]
 
     @property
     @quick_jit
@@ -205,7 +202,7 @@ def _checked_signed_area(control: np.ndarray) -> float:
     samples = max(4, min(16, 1200 // len(control)))  # per segment; all pairs of samples are compared
     point, velocity, _ = _evaluate(control, np.arange(len(control) * samples) / samples, np)
     points, speed = np.stack(point, axis=1), np.hypot(*velocity)
-    size, area = float(np.max(np.ptp(points, axis=0))), signed_area(points)
+    size, area = float(np.max(np.ptp(points, axis=0))), signed_area(np, points)
     if abs(area) <= 1e-9 * size**2:
         raise ValueError(f"control: the curve encloses no area ({abs(area):.3g} m^2)")
     if speed.min() <= 1e-6 * speed.max():
@@ -228,13 +225,8 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
     points, velocity, second = _evaluate(known.astype(np.float64), np.arange(32 * count) / 32, np)
     curvature = np.asarray(velocity.cross(second)) / np.hypot(*velocity) ** 3
     # Error of the curvature from roundoff in the second differences of the control points.
-    tolerance = (
-        16
-        * float(jnp.finfo(control.dtype).eps)
-        * count**2
-        * np.max(np.abs(known))
-        / np.max(np.ptp(points, axis=1)) ** 2
-    )
+    roundoff = 16 * float(jnp.finfo(control.dtype).eps) * count**2
+    tolerance = roundoff * np.max(np.abs(known)) / np.max(np.ptp(points, axis=1)) ** 2
     convex = bool(curvature.min() >= -tolerance)
     if claimed and not convex:
         near = int(np.argmin(curvature)) // 32

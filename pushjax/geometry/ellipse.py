@@ -34,16 +34,10 @@ class EllipseOutline(OvalOutline):
     center: Vec2
     semi: Vec2  # semi-axes along x and y
 
-    def _evaluate(self, q: Vec2) -> tuple[Vec2, Vec2, Scalar]:
-        """Return the point at `q` relative to the center, the outward unit normal, and the speed, m per rad."""
-        scaled_normal = Vec2(self.semi.y * q.x, self.semi.x * q.y)
-        speed = jnp.sqrt(scaled_normal.dot(scaled_normal))
-        return Vec2(self.semi.x * q.x, self.semi.y * q.y), scaled_normal.scale(1 / speed), speed
-
     def closest(self, x: Vec2) -> ClosestPoint:
         rel = x - self.center
         q = _closest_parameter(self.semi, rel)
-        foot, normal, _ = self._evaluate(q)
+        foot, normal = Vec2(self.semi.x * q.x, self.semi.y * q.y), _unit(Vec2(self.semi.y * q.x, self.semi.x * q.y))
         return ClosestPoint(normal.dot(rel - foot), self.center + foot, normal)
 
     def facing(self, direction: Vec2) -> FacingPoints:
@@ -145,15 +139,11 @@ def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi
     zero_tolerance = 2 * jnp.finfo(ax.dtype).eps * (jnp.abs(a2_minus_b2) + ax + by)
     least_slope = jnp.full_like(ax, jnp.finfo(ax.dtype).tiny)
     iterations = CLOSEST_ITERATIONS[ax.dtype == jnp.float64]
-    return _falling_root_on_circle(
-        lambda q: _closest_residual(a2_minus_b2, ax, by, q, least_slope),
-        q,
-        low,
-        high,
-        zero_tolerance,
-        iterations,
-        ax,
-    )
+
+    def residual(q: Vec2) -> tuple[Scalar, Scalar, Scalar]:
+        return _closest_residual(a2_minus_b2, ax, by, q, least_slope)
+
+    return _falling_root_on_circle(residual, q, low, high, zero_tolerance, iterations, ax)
 
 
 class Ellipse(Shape):

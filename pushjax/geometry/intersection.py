@@ -19,6 +19,7 @@ vertices, so edges that coincide, exactly or up to roundoff, need no special cas
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, checked_array, common_dtype, concrete
@@ -52,7 +53,7 @@ def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
             raise ValueError(f"{name}: a polygon needs at least three vertices; got {array.shape[0]}")
         polygons.append(array)
     known = [concrete(polygon) for polygon in polygons]
-    if known[0] is not None and known[1] is not None and signed_area(known[0]) * signed_area(known[1]) < 0:
+    if known[0] is not None and known[1] is not None and signed_area(np, known[0]) * signed_area(np, known[1]) < 0:
         raise ValueError("first and second: one polygon runs counterclockwise and the other clockwise")
     # Vertices are relative to one of them, so that polygons far from the origin do not lose digits.
     a, b = (polygon - polygons[1][:1] for polygon in polygons)
@@ -98,10 +99,8 @@ def _pair_areas(a: _Edges, b: _Edges) -> Array:
     """Return the term of each pair of edges in the sum of this module's header."""
     # Where x of `a` and `b` are equal, x of `a` counts as the smaller one, in every comparison. So at a tie the
     # derivative applies to polygons that lie side by side, and is not a mixture that no small motion has.
-    low, high = (
-        jnp.where(a.left_x > b.left_x, a.left_x, b.left_x),
-        jnp.where(a.right_x > b.right_x, b.right_x, a.right_x),
-    )
+    low = jnp.where(a.left_x > b.left_x, a.left_x, b.left_x)
+    high = jnp.where(a.right_x > b.right_x, b.right_x, a.right_x)
     width = jnp.where((a.left_x <= b.right_x) & (b.left_x < a.right_x), high - low, 0.0)
     at_low = a.at_left(low) - b.at_left(low)
     at_high = a.at_right(high) - b.at_right(high)

@@ -38,7 +38,7 @@ class Polygon(Shape):
         known = concrete(array)
         if known is not None:
             check_simple_polygon("vertices", known.astype(np.float64))
-            if signed_area(known.astype(np.float64)) < 0:
+            if signed_area(np, known.astype(np.float64)) < 0:
                 array = on_device(np.roll(known[::-1], 1, axis=0))
         self.vertices = array
         self.convex = _is_convex(array, convex)
@@ -87,7 +87,7 @@ class Polygon(Shape):
 
     @property
     def area(self) -> Float[Array, ""]:
-        return _area(self.vertices)
+        return in_numpy(signed_area)(self.vertices)
 
     @property
     def centroid(self) -> Float[Array, "2"]:
@@ -95,7 +95,7 @@ class Polygon(Shape):
 
     @property
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        return _bounds(self.vertices)
+        return in_numpy(lambda xp, vertices: (xp.min(vertices, axis=0), xp.max(vertices, axis=0)))(self.vertices)
 
     @property
     def perimeter(self) -> Float[Array, ""]:
@@ -108,9 +108,7 @@ class Polygon(Shape):
         edge = jnp.diff(closed, axis=0)
         arc_length = jnp.concatenate([jnp.zeros(1, edge.dtype), jnp.cumsum(jnp.hypot(edge[:, 0], edge[:, 1]))])
         wanted = (jnp.arange(points, dtype=edge.dtype) + 0.5) / points * arc_length[-1]
-        return jnp.stack(
-            [jnp.interp(wanted, arc_length, closed[:, 0]), jnp.interp(wanted, arc_length, closed[:, 1])], axis=1
-        )
+        return jnp.stack([jnp.interp(wanted, arc_length, coordinate) for coordinate in closed.T], axis=1)
 
     def inset(self, depth: ArrayLike) -> "Polygon":
         """Move every edge of the polygon inward.
@@ -150,27 +148,12 @@ def _rectangle(xp, width, height):
 
 
 @in_numpy
-def _area(xp, vertices):
-    """Return the area of the polygon, m^2, positive if the vertices run counterclockwise."""
-    # Vertices are relative to the first one, so that a polygon far from the origin does not lose digits.
-    start = vertices - vertices[:1]
-    end = xp.roll(start, -1, axis=0)
-    return xp.sum(start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]) / 2
-
-
-@in_numpy
 def _centroid(xp, vertices):
     """Return the centroid of the area, shape (2,), m."""
-    start = vertices - vertices[:1]  # relative, as for the area
+    start = vertices - vertices[:1]  # relative, as in `signed_area`
     end = xp.roll(start, -1, axis=0)
     double_area = start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]
     return vertices[0] + xp.sum((start + end) * double_area[:, None], axis=0) / (3 * xp.sum(double_area))
-
-
-@in_numpy
-def _bounds(xp, vertices):
-    """Return the lower and upper corner of the box around the vertices, each of shape (2,), m."""
-    return xp.min(vertices, axis=0), xp.max(vertices, axis=0)
 
 
 def _is_convex(vertices: Array, claimed: bool | None) -> bool:

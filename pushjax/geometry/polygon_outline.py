@@ -95,7 +95,7 @@ class PolygonOutline(Outline):
         return first, ClosestPoint(distance, point, normal)
 
     def pieces(self, x: Vec2) -> tuple[Float[Array, "pieces"], Vec2 | None]:
-        if self.convex:
+        if self.is_convex:
             return super().pieces(x)
         *_, from_edge = self.edges.foot(x)
         squared = from_edge.dot(from_edge)
@@ -108,12 +108,8 @@ class PolygonOutline(Outline):
         normal = tree_where(is_nearest, closest.normal, from_edge.scale(1 / length))
         return jnp.where(is_nearest, closest.distance, distance), normal
 
-    @property
-    def num_facing(self) -> int:
-        return self.edges.length.size
-
     def facing(self, direction: Vec2) -> FacingPoints:
-        return FacingPoints(self.edges.start, jnp.ones(self.num_facing, bool))
+        return FacingPoints(self.edges.start, jnp.ones(self.edges.length.size, bool))
 
 
 def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,6 +40,8 @@ class Outline(eqx.Module):
     # Its methods take and return `Vec2` instead of arrays; `pushjax._math.vec` gives the reason. Whatever does not
     # depend on the query point is computed once, when `Shape.outline` creates the outline.
 
+    max_rests: ClassVar[int] = 2  # number of places in which a straight edge may touch at the same time
+
     @property
     @abstractmethod
     def is_convex(self) -> bool:
@@ -49,11 +51,6 @@ class Outline(eqx.Module):
     def max_touches(self) -> int:
         """Number of places in which a round finger may touch at the same time, as `contact_candidates` finds them."""
         return 1 if self.is_convex else 2
-
-    @property
-    @abstractmethod
-    def num_facing(self) -> int:
-        """Number of points that `facing` returns."""
 
     @abstractmethod
     def closest(self, x: Vec2) -> ClosestPoint:
@@ -83,13 +80,11 @@ class Outline(eqx.Module):
 class OvalOutline(Outline):
     """A smooth convex outline, which faces each direction in one point."""
 
+    max_rests: ClassVar[int] = 1
+
     @property
     def is_convex(self) -> bool:
         return True
-
-    @property
-    def num_facing(self) -> int:
-        return 1
 
 
 class Shape(eqx.Module):
@@ -184,17 +179,22 @@ def roundoff(size: Scalar) -> Scalar:
     return 16 * jnp.finfo(size.dtype).eps * size
 
 
+def gauss_legendre(dtype: Any) -> tuple[Float[Array, "5"], Float[Array, "5"]]:
+    """Return nodes and weights on the unit interval that integrate polynomials up to degree nine exactly."""
+    nodes, weights = (jnp.asarray(part / 2, dtype) for part in np.polynomial.legendre.leggauss(5))
+    return nodes + 0.5, weights
+
+
 def equally_spaced(
     speed: Callable[[Array], Array], nodes: Float[Array, "nodes"], points: int
 ) -> tuple[Float[Array, "points"], Float[Array, ""]]:
     """Return parameters of points equally spaced in arc length along a closed smooth outline, and its length, m."""
     # `speed` maps parameters to the derivative of the arc length. The nodes increase from start to end, so densely that
     # the speed is smooth between two of them.
-    nodes_in_unit, weights = (jnp.asarray(part / 2, nodes.dtype) for part in np.polynomial.legendre.leggauss(5))
-    nodes_in_unit = nodes_in_unit + 0.5
+    nodes_in_unit, weights = gauss_legendre(nodes.dtype)
 
     def arc_length(start, width):
-        """Return the lengths from `start` to `start + width`, by Gauss-Legendre quadrature with five nodes."""
+        """Return the lengths from `start` to `start + width`."""
         return width * jnp.sum(weights[None] * speed(start[:, None] + width[:, None] * nodes_in_unit[None]), axis=1)
 
     width = jnp.diff(nodes)
@@ -218,31 +218,30 @@ def is_outline(vertices: Float[Array, "vertices 2"], convex: bool) -> Bool[Array
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     size = jnp.max(jnp.abs(vertices - vertices[:1]))
     turn = jnp.sum(jnp.arctan2(cross, jnp.sum(before * after, axis=1)))
-    relative = vertices - vertices[:1]
-    end = jnp.roll(relative, -1, axis=0)
-    area = jnp.sum(relative[:, 0] * end[:, 1] - relative[:, 1] * end[:, 0]) / 2
-    valid = jnp.all(jnp.sum(before**2, axis=1) > 0) & (area > roundoff(size * size)) & (jnp.abs(turn - 2 * jnp.pi) < 1)
+    has_area = signed_area(jnp, vertices) > roundoff(size * size)
+    valid = jnp.all(jnp.sum(before**2, axis=1) > 0) & has_area & (jnp.abs(turn - 2 * jnp.pi) < 1)
     return valid & jnp.all(cross >= -roundoff(size * jnp.hypot(after[:, 0], after[:, 1]))) if convex else valid
 
 
-def signed_area(v: np.ndarray) -> float:
+def signed_area(xp: Any, vertices: Any) -> Any:
     """Return the signed area of a closed polyline (vertices, 2), m^2, positive if it runs counterclockwise."""
-    relative = v - v[0]
-    next_vertex = np.roll(relative, -1, axis=0)
-    return float(np.sum(relative[:, 0] * next_vertex[:, 1] - next_vertex[:, 0] * relative[:, 1]) / 2)
+    # Vertices are relative to the first one, so that a polygon far from the origin does not lose digits.
+    start = vertices - vertices[:1]
+    end = xp.roll(start, -1, axis=0)
+    return xp.sum(start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]) / 2
 
 
 def check_simple_polygon(name: str, v: np.ndarray) -> None:
     """Raise ValueError unless a closed polyline (vertices, 2) encloses an area and does not touch itself."""
     size = float(np.max(np.ptp(v, axis=0)))
     near = 1e-9 * size
-    pairs = np.zeros((0, 2), int) if size == 0 else np.concatenate(list(_edges_that_may_meet(v, near)))
+    pairs = np.concatenate(list(_edges_that_may_meet(v, near)))
     gap = np.linalg.norm(v[pairs[:, 0]] - v[pairs[:, 1]], axis=1)
-    if size == 0 or gap.min() <= near:
-        i, j = (0, 1) if size == 0 else pairs[np.argmin(gap)]
+    if gap.min() <= near:
+        i, j = pairs[np.argmin(gap)]
         raise ValueError(
-            f"{name}: {int(min(i, j))} and {int(max(i, j))} are the same point; each corner is given once, and the "
-            "first is not repeated at the end"
+            f"{name}: {i} and {j} are the same point; each corner is given once, and the first is not repeated at the "
+            "end"
         )
     if np.linalg.svd(v - v.mean(axis=0), full_matrices=False, compute_uv=False)[1] <= 1e-12 * size:
         raise ValueError(f"{name} lie on one line and enclose no area")

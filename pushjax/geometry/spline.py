@@ -167,7 +167,7 @@ class SplineOutline(Outline):
         return _closest_on_segment(segment, t, x)
 
     def contact_candidates(self, x: Vec2) -> tuple[ClosestPoint, ...]:
-        if self.convex:
+        if self.is_convex:
             return (self.closest(x),)
         minima, position, segment, t = self._find_closest(x)
         first = _closest_on_segment(segment, t, x)
@@ -178,10 +178,6 @@ class SplineOutline(Outline):
         (found,) = compute_once((jnp.any(others) & (second.distance > 0),), x.x)
         none = ClosestPoint(first.distance + self.perimeter, first.point, first.normal)
         return first, tree_where(found, second, none)
-
-    @property
-    def num_facing(self) -> int:
-        return self.segments.c0.x.size
 
     def facing(self, direction: Vec2) -> FacingPoints:
         """Return the points on which a straight edge on the side of `direction` can rest; see `Outline.facing`."""

@@ -86,7 +86,7 @@ class WallPair(Pair):
     """A wall and any outline."""
 
     def count(self, outline):
-        return min(2, outline.num_facing)
+        return outline.max_rests
 
     def distance(self, finger, outline, pose):
         places = self._places(outline, pose)
