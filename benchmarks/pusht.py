@@ -3,7 +3,7 @@
 Needs gym-pusht: pip install 'gym-pusht==0.1.8' 'pymunk<7'. The episodes start at its own resets, and both get the same
 actions: positions 20 px ahead of the agent, toward a random point of the T. Speeds are of gym-pusht, of pymunk alone
 (no observation and no coverage) and of `pushjax.tasks.PushT` (observation, coverage, reward and automatic resets
-included), in one process. So are the times of a picture, the observation "pixels".
+included), in one process.
 """
 
 import time
@@ -25,7 +25,6 @@ from pushjax.tasks import PushT, TaskState
 AT_ONCE = 64  # episodes in one program
 REACH = 2.5  # px, from the faces of the walls, where pymunk's margin still holds the T
 ACTIONS = "steered", "uniform"
-PICTURES = 512  # pictures that are drawn together
 LIMITS = {"free": (1.5, 1.0), "walls": (3.0, np.inf)}  # px and degrees
 
 
@@ -65,8 +64,7 @@ def run(
     rows: list[dict[str, Any]] = []
     speeds: dict[str, dict[str, float]] = {}
     settings = {"seeds": seeds, "steps": steps, "substeps": substeps, "batch": batch, "seed": seed}
-    pictures: dict[str, float] = {}
-    record = result_record("pusht", settings, rows=rows, control_steps_per_second=speeds, seconds_per_picture=pictures)
+    record = result_record("pusht", settings, rows=rows, control_steps_per_second=speeds)
     parts = 1 + len(substeps) * (1 + len(ACTIONS) * bool(batch))
     episodes = recorded(seeds, steps, seed)
     progress(1, parts)
@@ -84,8 +82,6 @@ def run(
             keep(record)
             done += 1
             progress(done, parts)
-    if batch:
-        pictures |= {"gym-pusht": _gym_picture_seconds(), "pushjax": _picture_seconds()}
     return record
 
 
@@ -101,10 +97,8 @@ def summary(record: dict[str, Any]) -> str:
                 f"{part['angle_deg'][0]:.2f}, {part['angle_deg'][1]:.2f}°, coverage {part['coverage'][1]:.3f} (90 %); "
                 f"{100 * part['within']:.1f} % within {LIMITS[kind][0]} px"
             )
-        lines += [f"    farther off: {each}" for each in row["farther_off"]]
     for kind, speeds in record["control_steps_per_second"].items():
         lines += [f"{name:24}{speed:12,.0f} control steps/s, {kind} actions" for name, speed in speeds.items()]
-    lines += [f"{name:24}{1e3 * each:12.3f} ms a picture" for name, each in record["seconds_per_picture"].items()]
     return "\n".join(lines)
 
 
@@ -129,13 +123,13 @@ def recorded(seeds: int, steps: int, seed: int = 0) -> Recorded:
     return Recorded(np.array(starts), taken, seen, covered, np.array(at_wall))
 
 
-def make_gym(observation: str = "state") -> Any:
-    """Return gym-pusht's environment with a kind of observation, without Gymnasium's wrappers."""
+def make_gym() -> Any:
+    """Return gym-pusht's environment, without Gymnasium's wrappers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import gym_pusht.envs
 
-        return gym_pusht.envs.PushTEnv(obs_type=observation)
+        return gym_pusht.envs.PushTEnv(obs_type="state")
 
 
 def random_action(env: Any, rng: np.random.Generator) -> np.ndarray:
@@ -174,7 +168,7 @@ def compared(env: PushT, episodes: Recorded) -> dict[str, Any]:
     padded = np.arange(-(-count // AT_ONCE) * AT_ONCE) % count
     ends, coverages = [], []
     for part in padded.reshape(-1, AT_ONCE):
-        states = jax.vmap(lambda row: env.state_of(row, params))(jnp.asarray(episodes.start[part]))
+        states = states_at(env, params, episodes.start[part])
         _, (_, _, _, _, _, info) = replayed(env, states, jnp.asarray(episodes.actions[:, part]), params)
         ends.append(np.asarray(info["final_observation"])[-1])
         coverages.append(np.asarray(info["coverage"])[-1])
@@ -184,7 +178,7 @@ def compared(env: PushT, episodes: Recorded) -> dict[str, Any]:
     position = np.linalg.norm(end[:, 2:4] - wanted[:, 2:4], axis=1)
     turn = np.degrees(np.abs((end[:, 4] - wanted[:, 4] + np.pi) % (2 * np.pi) - np.pi))
     kinds = np.where(episodes.at_wall, "walls", "free")
-    found: dict[str, Any] = {"farther_off": []}
+    found = {}
     for kind, (pixels, degrees) in LIMITS.items():
         chosen = kept & (kinds == kind)
         within = (position <= pixels) & (turn <= degrees)
@@ -195,29 +189,7 @@ def compared(env: PushT, episodes: Recorded) -> dict[str, Any]:
             "angle_deg": np.quantile(turn[chosen], [0.5, 0.9]).tolist(),
             "coverage": np.quantile(covered[chosen], [0.5, 0.9]).tolist(),
         }
-        for k in np.flatnonzero(chosen & ~within):
-            cause = _cause(env, params, episodes, int(k))
-            off = f"{position[k]:.1f} px, {turn[k]:.1f}°"
-            found["farther_off"].append(f"episode {k}, {kind}: {off}: {cause}")
     return found
-
-
-def _cause(env: PushT, params: Any, episodes: Recorded, k: int) -> str:
-    """Return why an episode differs: how it started, or what a shift of the start by 0.1 px does to it."""
-    starts = np.repeat(episodes.start[None, k], AT_ONCE, axis=0)
-    starts[:, 2:4] += 0.1 * np.random.default_rng(0).standard_normal((AT_ONCE, 2))
-    shape = env.default_params.slider.shape
-    states = states_at(env, params, starts)
-    angle = starts[0, 4]
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    offset = turn @ (starts[0, :2] - np.asarray(states.pose[0, :2], float)) * env.METERS
-    if float(shape.signed_distance(offset)) < 0.015:
-        return "the agent starts inside the T"
-    actions = np.repeat(episodes.actions[:, k, None], AT_ONCE, axis=1)
-    _, (_, _, _, _, _, info) = replayed(env, states, jnp.asarray(actions), params)
-    end = np.asarray(info["final_observation"])[-1, :, 2:4]
-    spread = np.linalg.norm(end - np.median(end, axis=0), axis=1).max()
-    return f"starts within 0.1 px of it end up to {spread:.1f} px apart"
 
 
 def _gym_speed(whole: bool, kind: str, seconds: float = 3.0) -> float:
@@ -241,31 +213,3 @@ def _gym_speed(whole: bool, kind: str, seconds: float = 3.0) -> float:
                 env.space.step(env.dt)
         done += 1
     return done / (time.process_time() - start)
-
-
-def _gym_picture_seconds(steps: int = 100) -> float:
-    """Return the CPU time of a picture of gym-pusht: of a control step with pictures, less that of one without."""
-    seconds = []
-    for observation in ("pixels", "state"):
-        env, rng = make_gym(observation), np.random.default_rng(0)
-        env.reset(seed=0)
-        start = time.process_time()
-        for _ in range(steps):
-            env.step(rng.uniform(0, 512, 2))
-        seconds.append((time.process_time() - start) / steps)
-    return seconds[0] - seconds[1]
-
-
-def _picture_seconds(repeats: int = 5) -> float:
-    """Return the CPU time of a picture of PushT in a batch of `PICTURES`, the median of some."""
-    env, keys = PushT(observation="pixels"), jax.random.split(jax.random.key(0), PICTURES)
-    params = env.default_params
-    _, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    draw = jax.jit(jax.vmap(lambda key, state: env.observe(key, state, None, params)))
-    jax.block_until_ready(draw(keys, states))
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
-        jax.block_until_ready(draw(keys, states))
-        seconds.append((time.process_time() - start) / PICTURES)
-    return float(np.median(seconds))
