@@ -5,7 +5,7 @@ batched with `vmap` and differentiated. Nothing is imported from gymnax.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8, UInt32
 
-from pushjax._internal.checks import ArrayLike, as_float, check_shape
+from pushjax._internal.checks import ArrayLike, as_float, check_shape, on_device
 from pushjax._internal.compaction import where_needed
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
@@ -38,13 +38,12 @@ class _Replaceable(eqx.Module):
         Raises:
             TypeError: For a name that is no field.
         """
-        unknown = sorted(set(changes) - set(type(self).__dataclass_fields__))
-        if unknown:
-            raise TypeError(f"{type(self).__name__} has no field {', '.join(unknown)}")
-        copy = object.__new__(type(self))
-        for name in type(self).__dataclass_fields__:
-            object.__setattr__(copy, name, changes.get(name, getattr(self, name)))
-        return copy
+        return replace(self, **changes)
+
+
+def _as_count(number: Any) -> Array:
+    """Return a whole number as an array, so that all numbers share one program."""
+    return number if isinstance(number, Array) else on_device(np.asarray(number, np.int32))
 
 
 class TaskParams(_Replaceable):
@@ -74,7 +73,7 @@ class TaskParams(_Replaceable):
     angle_noise: Float[Array, ""] | None
     action_noise: Float[Array, ""] | None
     success_coverage: Float[Array, ""]
-    max_steps_in_episode: int | Int[Array, ""]
+    max_steps_in_episode: Int[Array, ""] = eqx.field(converter=_as_count)
 
 
 class TaskState(_Replaceable):

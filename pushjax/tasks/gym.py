@@ -69,9 +69,8 @@ class TaskEnv(gymnasium.Env):
         render_size: int = 680,
         **options: Any,
     ):
-        self.task = _task(task, options)
-        self.params = self.task.default_params if params is None else params
-        self.render_mode, self.render_size = _checked_rendering(render_mode, render_size)
+        checked = _checked(task, params, render_mode, render_size, options)
+        self.task, self.params, self.render_mode, self.render_size = checked
         self.observation_space = _space(self.task.observation_space(self.params))
         self.action_space = _space(self.task.action_space(self.params))
         self._max_episode_steps = int(self.params.max_steps_in_episode)  # read where no `TimeLimit` has it
@@ -170,8 +169,8 @@ class TaskVectorEnv(VectorEnv):
         render_size: int = 680,
         **options: Any,
     ):
-        self.task = _task(task, options)
-        self.params = self.task.default_params if params is None else params
+        checked = _checked(task, params, render_mode, render_size, options)
+        self.task, self.params, self.render_mode, self.render_size = checked
         if max_episode_steps is not None:
             check_count("max_episode_steps", max_episode_steps)
             self.params = self.params.replace(max_steps_in_episode=max_episode_steps)
@@ -179,7 +178,6 @@ class TaskVectorEnv(VectorEnv):
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = METADATA | {"autoreset_mode": self.autoreset_mode}
-        self.render_mode, self.render_size = _checked_rendering(render_mode, render_size)
         self.single_observation_space = _space(self.task.observation_space(self.params))
         self.single_action_space = _space(self.task.action_space(self.params))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -282,17 +280,24 @@ class TaskVectorEnv(VectorEnv):
         return np.where(given[:, None], _keys([0 if one is None else index(one) for one in seeds]), keys)
 
 
-def _task(task: str | Environment, options: dict[str, Any]) -> Environment:
-    """Return the task that the arguments describe."""
+def _checked(
+    task: str | Environment, params: Any, mode: str | None, size: int, options: dict[str, Any]
+) -> tuple[Environment, Any, str | None, int]:
+    """Return the arguments that the two classes share, with the task and its parameters, after checks."""
     _processes.append(os.getpid())
-    if not isinstance(task, str):
+    if isinstance(task, str):
+        if task not in TASKS:
+            raise ValueError(f"task must be one of {', '.join(TASKS)}; got {task!r}")
+        made = getattr(tasks, task)(**options)
+    else:
         check_type("task", task, Environment)
         if options:
             raise TypeError(f"{', '.join(options)}: options go with the name of a task; got the task itself")
-        return task
-    if task not in TASKS:
-        raise ValueError(f"task must be one of {', '.join(TASKS)}; got {task!r}")
-    return getattr(tasks, task)(**options)
+        made = task
+    if mode not in (None, *METADATA["render_modes"]):
+        raise ValueError(f"render_mode must be 'rgb_array' or None; got {mode!r}")
+    check_count("render_size", size)
+    return made, made.default_params if params is None else params, mode, size
 
 
 def _check_process() -> None:
@@ -303,13 +308,6 @@ def _check_process() -> None:
             "JAX cannot be used in a process that was forked after it had run: use gymnasium.make_vec without "
             "vectorization_mode, which computes all environments in one step, or AsyncVectorEnv with context='spawn'"
         )
-
-
-def _checked_rendering(mode: str | None, size: int) -> tuple[str | None, int]:
-    if mode not in (None, *METADATA["render_modes"]):
-        raise ValueError(f"render_mode must be 'rgb_array' or None; got {mode!r}")
-    check_count("render_size", size)
-    return mode, size
 
 
 def _space(space: Space) -> Any:

@@ -26,18 +26,11 @@ class PushAlongWall(PushBox):
     The wall has the face y = -0.15 m, and friction with the block (`wall_friction`). The finger does not reach it,
     because its motion is limited. A finger that would press a block into the wall stops.
 
-    An episode terminates when the block covers 0.9 of the goal, and is truncated after 100 control steps. Actions,
-    observations and rewards are those of `PushBox`.
+    Actions, observations and rewards are those of `PushBox`.
 
     - Start: the block left of the middle and at any angle, and the finger above it. The circle through the corner that
       is farthest from the block's center is up to 0.05 m away from the wall.
     - Goal: the block at x = 0.1 m, with the angle zero.
-
-    Attributes:
-        substeps: Steps of the simulator in a control step.
-
-    Raises:
-        ValueError: If `substeps` is not a whole number of at least one.
 
     Examples:
         >>> import jax, pushjax as pj

@@ -19,20 +19,12 @@ SPREAD = 0.05  # m, of the distance between finger and block at the start
 class PushBox(TableTask):
     """A round finger pushes a block on a table to a pose in the middle.
 
-    An episode terminates when the block covers 0.9 of the goal, and is truncated after 100 control steps.
+    Rewards, and when an episode ends, are those of every `TableTask`.
 
     - Action: motion of the finger in a control step along x and y, (2,), from -1 to 1, in units of 0.02 m.
     - Observation: finger x and y, block x and y, and cosine and sine of its angle times its `symmetry`, which is 2 for
       the default block, (6,).
-    - Reward: -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
-      times the length of the limit surface. b is the distance between the centers of finger and block.
     - Start: the block in a square of 0.2 m, at any angle, and the finger beside it.
-
-    Attributes:
-        substeps: Steps of the simulator in a control step.
-
-    Raises:
-        ValueError: If `substeps` is not a whole number of at least one.
 
     Examples:
         >>> import jax, pushjax as pj

@@ -23,21 +23,13 @@ class PushTwoFingers(TableTask):
 
     While both fingers touch one side of the block, it can be pushed along a curve without sliding.
 
-    An episode terminates when the block covers 0.9 of the goal, and is truncated after 100 control steps.
+    Rewards, and when an episode ends, are those of every `TableTask`.
 
     - Action: motion of the hand in a control step along x and y, in units of 0.02 m, and its turn, in units of 0.2 rad,
       (3,), from -1 to 1.
     - Observation: hand x and y, in the middle between the fingers, cosine and sine of its angle; block x and y, and
       cosine and sine of its angle times its `symmetry`, which is 2 for the default block, (8,).
-    - Reward: -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
-      times the length of the limit surface. b is the distance between the centers of hand and block.
     - Start: the block in a square of 0.2 m, at any angle, and the hand beside it, at any angle.
-
-    Attributes:
-        substeps: Steps of the simulator in a control step.
-
-    Raises:
-        ValueError: If `substeps` is not a whole number of at least one.
 
     Examples:
         >>> import jax, pushjax as pj

@@ -32,7 +32,7 @@ def shared_params(
         "model": model,
         "surfaces": None if model is None else model.around(slider.surface),
         "success_coverage": checked_array("success_coverage", success_coverage, (), non_negative=True),
-        "max_steps_in_episode": int(max_steps_in_episode),
+        "max_steps_in_episode": max_steps_in_episode,
     } | {
         name: None if value is None else checked_array(name, value, (), non_negative=True)
         for name, value in noise.items()

@@ -29,14 +29,12 @@ class Squeeze(TableTask):
     jaw first closes or opens, and stops closing where it grasps the block. Then it moves. A block that it has squeezed
     in this control step moves with it as one body; otherwise the pads push the block.
 
-    An episode terminates when the block is held and covers 0.9 of the goal, and is truncated after 100 control steps.
+    Rewards, and when an episode ends, are those of every `TableTask`; it terminates only while the block is held.
 
     - Action: motion of the jaw in a control step along x and y, in units of 0.02 m, its turn, in units of 0.2 rad, and
       how much it opens, in units of 0.02 m, (4,), from -1 to 1.
     - Observation: jaw x and y, cosine and sine of its angle, its opening; block x and y, and cosine and sine of its
       angle times its `symmetry`, which is 2 for the default block, (9,).
-    - Reward: -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
-      times the length of the limit surface. b is the distance between the centers of jaw and block.
     - Start: the block in a square of 0.2 m, at any angle, and the open jaw around it, at any angle.
     - `info` also has "is_held": whether the mean of the block's corners is between the pads, and both pads are within
       1 mm of the block.

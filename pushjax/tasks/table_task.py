@@ -1,9 +1,6 @@
 """Tasks on a table: a hand moves a block to a pose, in meters, with friction at the fingers and under the block.
 
 The action says how far the hand moves in a control step of 0.1 s, as a fraction from -1 to 1 of the most that it can.
-The reward is -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
-times the length of the limit surface. b is the distance between the centers of hand and block. The reward is never
-positive, so an episode that ends early costs less.
 
 Poses between which the outline of the block is the same count as equal, in observations, rewards and success.
 """
@@ -65,6 +62,10 @@ class TableTask(Environment):
     observation consists of the configuration of the hand, with the cosine and the sine of its angle, and the block's x,
     y, and cosine and sine of its angle times the block's `symmetry`. The interface is that of gymnax 1.x
     (`Environment`).
+
+    The reward is -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the
+    angle times the length of the limit surface. b is the distance between the centers of hand and block. The reward is
+    never positive, so an episode that ends early costs less.
 
     Attributes:
         substeps: Steps of the simulator in a control step.

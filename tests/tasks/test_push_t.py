@@ -1,5 +1,6 @@
 """PushT: starts, observations and bad input."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -170,13 +171,21 @@ def test_bad_input(wrong, message):
         wrong()
 
 
+def test_a_time_limit_is_no_constant_of_a_program():
+    """Parameters that differ in it share their compiled programs."""
+    limits = ENV.params(max_steps_in_episode=5), ENV.default_params, ENV.default_params.replace(max_steps_in_episode=7)
+    assert [int(each.max_steps_in_episode) for each in limits] == [5, 300, 7]
+    constants = [eqx.filter(each, eqx.is_array, inverse=True) for each in limits]
+    assert eqx.tree_equal(*constants)
+
+
 def test_wrong_types_and_actions():
     with pytest.raises(TypeError, match="block"):
         ENV.params(block=pj.Disk(20.0))
     foreign = type("Polygon", (), {"__module__": "shapely.geometry"})()
     with pytest.raises(TypeError, match=r"expected a pushjax\.geometry.*\.Polygon; got a shapely\.geometry\.Polygon"):
         ENV.params(block=foreign)
-    with pytest.raises(TypeError, match="has no field speed"):
+    with pytest.raises(TypeError, match="speed"):
         ENV.default_params.replace(speed=1)
     _, state = ENV.reset(jax.random.key(0))
     with pytest.raises(ValueError, match=r"action has shape \(3,\)"):
