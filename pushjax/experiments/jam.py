@@ -25,6 +25,7 @@ from pushjax.experiments._report import Table, saved, table
 from pushjax.experiments._slider_options import fitted_surface
 
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
+THRESHOLD = HALF_OFFSET / HALF_WIDTH  # friction from which the fingers jam, by statics alone
 CLOSING = 0.001  # displacement of each finger, m
 BELOW, ABOVE = 0.25, 0.55  # frictions that are drawn
 THRESHOLD_DISTANCE = 1e-3  # relative distance from the threshold to the nearest friction on either side of it
@@ -38,18 +39,6 @@ def contacts(friction) -> pj.Contacts:
     return pj.Contacts(point, normal, CLOSING * normal, friction)
 
 
-def threshold() -> float:
-    """Return the coefficient of friction h / a from which the fingers jam, by statics alone."""
-    return HALF_OFFSET / HALF_WIDTH
-
-
-def surfaces(seed: int) -> tuple[pj.Polygon, dict[str, pj.LimitSurface]]:
-    """Return the rectangle, and by name an ellipsoid and a quartic that are fitted to uniform pressure."""
-    block = pj.Polygon.rectangle(2 * HALF_WIDTH, 0.05)
-    support = pj.Support.uniform(block, points=64)
-    return block, {name: fitted_surface(support, name, seed) for name in ("ellipsoid", "quartic")}
-
-
 def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     """Find the status over friction with both surfaces, and compare the threshold found with the expected one.
 
@@ -61,12 +50,14 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
         The record. It has one row per surface: the smallest friction that jams, the largest that moves, the threshold
         by statics, and all statuses. `verdicts` holds the status at the two drawn frictions.
     """
-    block, surface_by_name = surfaces(seed)
-    near_threshold = threshold() * (1 + THRESHOLD_DISTANCE * jnp.array([-1.0, 1.0]))
+    block = pj.Polygon.rectangle(2 * HALF_WIDTH, 0.05)
+    support = pj.Support.uniform(block, points=64)
+    near_threshold = THRESHOLD * (1 + THRESHOLD_DISTANCE * jnp.array([-1.0, 1.0]))
     scanned = jnp.sort(jnp.append(jnp.linspace(0.0025, 0.7975, 160), near_threshold))
     frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # the drawn ones last; one program solves all
     rows, motions = [], {}
-    for name, surface in surface_by_name.items():
+    for name in ("ellipsoid", "quartic"):
+        surface = fitted_surface(support, name, seed)
         motion_by_friction = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)
         status = np.asarray(motion_by_friction.status)[: len(scanned)]
         jammed, moving = status == pj.Status.JAMMED, status == pj.Status.MOVING
@@ -75,7 +66,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
                 "model": name,
                 "jams_from": float(scanned[np.argmax(jammed)]) if jammed.any() else None,
                 "last_moving": float(scanned[np.flatnonzero(moving)[-1]]),
-                "threshold": threshold(),
+                "threshold": THRESHOLD,
                 "statuses": sorted({pj.Status(int(s)).name for s in status}),
             }
         )
@@ -92,7 +83,7 @@ def summary(record: dict[str, Any]) -> list[str | Table]:
     """Return the report on a record of `run`."""
     verdicts = [{"friction": mu, "status": status} for mu, status in record["verdicts"].items()]
     return [
-        f"Two fingers close on opposite faces, offset: statics says they jam from a friction of {threshold():.4f}.",
+        f"Two fingers close on opposite faces, offset: statics says they jam from a friction of {THRESHOLD:.4f}.",
         table(
             record["rows"],
             ("surface", "model"),
