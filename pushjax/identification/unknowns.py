@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, checked_array, concrete
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, checked_array, concrete
 
 
 class _Unknown(NamedTuple):
@@ -113,10 +113,7 @@ class Unknowns(eqx.Module):
         for name in ("surface_dof", *NORMAL_PRIORS):
             prior = getattr(self, name)
             if prior is not None:
-                if prior.shape != ():
-                    raise ValueError(f"{name} has shape {prior.shape}; expected a scalar, or None for what is known")
-                check_finite(name, prior)
-                check_positive(name, prior)
+                checked_array(name, prior, (), positive=True)
         if self.sides < 1:
             raise ValueError(f"sides must be at least 1; got {self.sides}")
         unknown = [name for name in self.shared if name not in NAMES]

@@ -58,11 +58,9 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
 def _draw_counts(figure: Figure, axes: Axes, paths: np.ndarray) -> None:
     """Draw how many of the paths (pushes, steps + 1, 2), mm, pass each cell of `CELL` mm, with a color bar."""
     cells = np.floor(paths / CELL).astype(int)
-    first = cells.min(axis=(0, 1))
     push = np.broadcast_to(np.arange(len(paths))[:, None, None], (*cells.shape[:2], 1))
-    passed = np.unique(np.concatenate([push, cells - first], axis=2).reshape(-1, 3), axis=0)[:, 1:]
-    counts = np.zeros(passed.max(axis=0) + 1)
-    np.add.at(counts, tuple(passed.T), 1)
-    edges = [CELL * (first[k] + np.arange(counts.shape[k] + 1)) for k in (0, 1)]
-    drawn = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, norm=LogNorm(1, len(paths)), cmap="Blues")
+    passed = np.unique(np.concatenate([push, cells], axis=2).reshape(-1, 3), axis=0)[:, 1:]
+    counts, x, y = np.histogram2d(*passed.T, bins=[np.arange(each.min(), each.max() + 2) for each in passed.T])
+    shown = np.where(counts > 0, counts, np.nan).T
+    drawn = axes.pcolormesh(CELL * x, CELL * y, shown, norm=LogNorm(1, len(paths)), cmap="Blues")
     figure.colorbar(drawn, ax=axes, label="paths of the centroid / (1/mm²)", shrink=0.6)

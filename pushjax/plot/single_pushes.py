@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from pushjax.contact.status import Status
 from pushjax.datasets.recordings import Recording
 from pushjax.geometry.shape import Shape
-from pushjax.plot.forces import SQUEEZE_LABEL, Forces, squeeze_forces
+from pushjax.plot.forces import SQUEEZE_LABEL, squeeze_forces
 from pushjax.plot.parts import (
     arrow,
     centroids,
@@ -65,8 +65,9 @@ def push_figure(
             axes.plot(*centroids(shape, pose).T, color=BLUE, lw=1.4, label="centroid of the slider", zorder=4)
             squeeze = None if friction is None else squeeze_forces(shape, hand, push, friction)
             if squeeze is not None:
-                _draw_squeeze(axes, squeeze, ARROW_LENGTH * float(np.ptp(vertices(shape), axis=0).max()))
-                held = True
+                length, held = ARROW_LENGTH * float(np.ptp(vertices(shape), axis=0).max()), True
+                for tip, force in zip(*squeeze, strict=True):  # the arrows end at the contacts
+                    arrow(axes, MM * (tip - length * force), MM * tip, ORANGE, 2.0)
             draw_fixtures(axes, fixtures)
             axes.set(title=_title_with_failure(name.replace(": ", ":\n"), push), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
@@ -84,12 +85,6 @@ def _moments(pose: np.ndarray, frames: int) -> list[tuple[int, str]]:
     first, last = (0, len(pose) - 1) if moving.size == 0 else (moving[0], moving[-1] + 1)
     between = np.linspace(first, last, frames + 2).round().astype(int)[1:-1]
     return [*((k, GRAY) for k in between), (0, BLACK), (last, RED)]
-
-
-def _draw_squeeze(axes: Axes, squeeze: Forces, length: float) -> None:
-    """Draw the forces of a squeeze as arrows that end at the contacts, `length` m long per unit force."""
-    for tip, tail in zip(MM * squeeze.point, MM * (squeeze.point - length * squeeze.force), strict=True):
-        arrow(axes, tail, tip, ORANGE, 2.0)
 
 
 def _title_with_failure(name: str, push: Trajectory) -> str:
