@@ -72,12 +72,11 @@ def transits_between(
     for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
         scatter = _displacement(vertices, pose, samples[:, k])
         margins = [*(clearance + np.quantile(scatter, q) for q in QUANTILES), clearance, TIGHT * clearance]
-        tried = (_transit(around, margin, paths[k : k + 1], pose, origin) for margin in margins)
-        transit = next((each for each in tried if each.status == TransitStatus.FOUND), None)
-        if transit is None:  # the last attempt is the least demanding, and tells why
-            transit = _transit(around, margins[-1], paths[k : k + 1], pose, origin)
-        else:
-            touched |= _touches(vertices, radius, transit.points, samples[:, k])
+        for margin in margins:  # the last attempt is the least demanding, and tells why there is none
+            transit = _transit(around, margin, paths[k : k + 1], pose, origin)
+            if transit.status == TransitStatus.FOUND:
+                touched |= _touches(vertices, radius, transit.points, samples[:, k])
+                break
         transits.append(transit)
     return Transits(tuple(transits), touched)
 
@@ -135,8 +134,7 @@ def _transit(
     """Return the transit to the start of the first of `paths`, or the retreat if there are none."""
     if len(paths):
         return _approach(around, margin, paths[0], pose, origin)
-    if origin is None:
-        raise ValueError("a retreat begins where a push ends")
+    assert origin is not None  # a retreat begins where a push ends
     return around.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose)
 
 

@@ -24,7 +24,6 @@ from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, Frict
 from pushjax.planning.planned_push import PlannedPush, PushStatus
 from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
 from pushjax.planning.push_planner import PushPlanner
-from pushjax.planning.roadmap import Transit, TransitStatus
 from pushjax.simulation.slider import Slider
 
 # Lengths in units of the surface's length
@@ -131,11 +130,7 @@ class PushController:
             self.friction_filter.update(self.prior, np.zeros(3), np.zeros((LEARNING_STEPS + 1, 2)), np.zeros(3))
         if self.feedback:
             far = self.planner.goal[:2] + 10 * self.length
-            aim = np.zeros(2)
-            push = PlannedPush(
-                PushStatus.ONE_PUSH, Transit(aim[None], 0.0, TransitStatus.FOUND), aim, aim, self.planner.goal, 0.0
-            )
-            self._corrected(far, self.planner.goal, far + 0.1 * self.length, push, self.prior)
+            self._reached(far, self.planner.goal, far + self.offsets, self.prior)
 
     def __call__(
         self, key: PRNGKeyArray, observation: Observation, state: ControllerState
@@ -276,13 +271,7 @@ class PushController:
         across = np.array([-along[1], along[0]])
         scale = min(1.0, FINE + remaining / (FULL * self.length) * (1 - FINE))
         ends = end + scale * (self.offsets[:, :1] * along + self.offsets[:, 1:] * across)
-        paths = position + (ends - position)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
-        slider, friction = self.scene.slider, self.scene.mean_friction
-        if belief is not None:
-            surface, mu = _mean(belief)
-            slider, friction = Slider(slider.shape, surface), float(mu)
-        poses, _ = simulate_pushes(slider, self.scene.hand, paths, np.broadcast_to(pose, (len(ends), 3)), friction)
-        final = poses[:, -1].astype(float)
+        final = self._reached(position, pose, ends, belief)
         features = self.planner.mean_library.features
         # least distance from the push's target, or, if the push is to reach the goal, largest score
         missed = np.linalg.norm(features(final) - features(push.target), axis=1)
@@ -291,6 +280,18 @@ class PushController:
             score = self.planner.measure(compose(inverse(self.planner.goal), final))
             cost = SCORE_WEIGHT * (1 - score) + DISTANCE_WEIGHT * cost
         return ends[np.argmin(cost)]
+
+    def _reached(
+        self, position: np.ndarray, pose: np.ndarray, ends: np.ndarray, belief: FrictionBelief | None
+    ) -> np.ndarray:
+        """Return the poses of the slider after pushes from one position to each of the ends, (ends, 3)."""
+        paths = position + (ends - position)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
+        slider, friction = self.scene.slider, self.scene.mean_friction
+        if belief is not None:
+            surface, mu = _mean(belief)
+            slider, friction = Slider(slider.shape, surface), float(mu)
+        poses, _ = simulate_pushes(slider, self.scene.hand, paths, np.broadcast_to(pose, (len(ends), 3)), friction)
+        return poses[:, -1].astype(float)
 
 
 _mean = jax.jit(FrictionBelief.mean)

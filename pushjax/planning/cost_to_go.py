@@ -5,10 +5,10 @@ move the slider by the same displacements wherever it is. So for each angle, a p
 stands for all pushes into that cell, and one sweep of the iteration takes minima of shifted grids.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import minimum_filter1d
+from scipy.ndimage import minimum_filter
 
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning.free_space import POSITIONS, FreeSpace, PoseGrid, grid_spacing
@@ -30,7 +30,7 @@ def cost_to_go(
     push_time: np.ndarray,  # (entries,), control steps of each entry of the library
     *,
     usable: np.ndarray,  # (pushes,), whether the finger can get to the start of each push
-    tolerance: float,  # of final poses that reach the goal, m, in the metric of `pose_features`
+    tolerance: float,  # of final poses that reach the goal, m, in the metric of `PushLibrary.features`
     between: float,  # control steps between two pushes
     low: np.ndarray,  # (2,), lowest position of the slider's origin on the grid, m
     high: np.ndarray,  # (2,), highest; the grid is square, so along the narrower axis it reaches beyond
@@ -44,28 +44,25 @@ def cost_to_go(
     cells = np.stack(np.meshgrid(*axes, theta, indexing="ij"), axis=-1).astype(np.float32)
     blocked = BoundingBoxTable(vertices).outside(cells, workspace) > 0
     values = _last_push(library, goal, cells, push_time, usable, tolerance, between, space)
-    moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
-    allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
+    cost = push_time + between
+    moves = [
+        _moves(library, workspace, cells[:, :, k], angle, spacing, cost, usable, space) for k, angle in enumerate(theta)
+    ]
     if space is not None:
         met = space.distances.nearest(cells) < space.slider_clearance
         blocked |= met
-        allowed = [
-            is_allowed & space.free_from_grid(library, angle, move.entry)
-            for is_allowed, angle, move in zip(allowed, theta, moves, strict=True)
-        ]
     for _ in range(SWEEPS):
-        change = 0.0
+        before = values.copy()
         for k, move in enumerate(moves):
-            best = _best_move(values, blocked, k, move, allowed[k])
-            new = np.minimum(values[:, :, k], best)
-            change = max(change, float(np.max(values[:, :, k] - new)))
-            values[:, :, k] = new
-        if change < CHANGE:
+            values[:, :, k] = np.minimum(values[:, :, k], _best_move(values, blocked, k, move))
+        if np.max(before - values) < CHANGE:
             break
     # A cell counts as blocked if the slider is too near to an obstacle at its center. At other poses in the cell the
     # slider may be free, so the cell gets the cost of the best neighbor, after one more pause between pushes.
     if space is not None:
-        values = np.where(met, _least_around(np.where(met, NEVER, values)) + between, values)
+        edges: Any = "nearest", "nearest", "wrap"  # SciPy's hints know a single mode only
+        around = minimum_filter(np.where(met, NEVER, values), 3, mode=edges)
+        values = np.where(met, around + between, values)
     return PoseGrid(np.asarray(low, np.float32), spacing, values)
 
 
@@ -74,7 +71,7 @@ class _Moves(NamedTuple):
 
     shift: np.ndarray  # (moves, 3), whole cells by which the slider moves
     cost: np.ndarray  # (moves,), control steps
-    entry: np.ndarray  # (moves,), entries of the library
+    allowed: np.ndarray  # (moves, positions, positions), whether finger and slider may make each move from each cell
 
 
 def _last_push(library, goal, cells, push_time, usable, tolerance, between, space) -> np.ndarray:
@@ -91,47 +88,33 @@ def _last_push(library, goal, cells, push_time, usable, tolerance, between, spac
     return values
 
 
-def _moves(library: PushLibrary, angle: float, spacing: float, cost: np.ndarray, usable: np.ndarray) -> _Moves:
-    """Return the cheapest push into each cell that some push ends near the center of."""
+def _moves(library, workspace, cells, angle, spacing, cost, usable, space) -> _Moves:
+    """Return the cheapest push into each cell that some push ends near the center of, from the cells of one angle."""
     pose = np.array([0.0, 0.0, angle], np.float32)
     reached = compose(pose, library.relative) - pose
-    cells = reached / np.array([spacing, spacing, 2 * np.pi / ANGLES], np.float32)
-    shift = np.rint(cells).astype(np.int32)
-    near = (np.abs(cells - shift).max(1) < NEAR_CENTER) & shift.any(1) & usable[library.entries[:, 0]]
+    apart = reached / np.array([spacing, spacing, 2 * np.pi / ANGLES], np.float32)
+    shift = np.rint(apart).astype(np.int32)
+    near = (np.abs(apart - shift).max(1) < NEAR_CENTER) & shift.any(1) & usable[library.entries[:, 0]]
     entry = np.flatnonzero(near)
     entry = entry[np.argsort(cost[entry], kind="stable")]
-    _, first = np.unique(_codes(shift[entry]), return_index=True)
+    wide = 2 * np.abs(shift).max(initial=0) + 1  # so that each distinct shift has its own number
+    _, first = np.unique(shift[entry] @ np.array([wide**2, wide, 1]), return_index=True)
     entry = entry[first]
-    return _Moves(shift[entry], cost[entry].astype(np.float32), entry)
+    starts = library.starts[library.entries[entry, 0]].astype(np.float32)
+    allowed = workspace.allows_finger(to_world(cells[None], starts[:, None, None]))
+    if space is not None:
+        allowed &= space.free_from_grid(library, angle, entry)
+    return _Moves(shift[entry], cost[entry].astype(np.float32), allowed)
 
 
-def _least_around(values: np.ndarray) -> np.ndarray:
-    """Return the least of the values of each cell and its neighbors."""
-    for axis, mode in ((0, "nearest"), (1, "nearest"), (2, "wrap")):
-        values = minimum_filter1d(values, 3, axis=axis, mode=mode)
-    return values
-
-
-def _codes(shift: np.ndarray) -> np.ndarray:
-    """Return one integer for each distinct row of integers."""
-    wide = 2 * int(np.abs(shift).max(initial=0)) + 1
-    return (shift[:, 0] * wide + shift[:, 1]) * wide + shift[:, 2]
-
-
-def _starts_allowed(library: PushLibrary, workspace: Workspace, cells: np.ndarray, moves: _Moves) -> np.ndarray:
-    """Return whether the finger can be where each move starts, (moves, positions, positions)."""
-    starts = library.starts[library.entries[moves.entry, 0]].astype(np.float32)
-    return workspace.allows_finger(to_world(cells[None], starts[:, None, None]))
-
-
-def _best_move(values: np.ndarray, blocked: np.ndarray, k: int, moves: _Moves, allowed: np.ndarray) -> np.ndarray:
+def _best_move(values: np.ndarray, blocked: np.ndarray, k: int, moves: _Moves) -> np.ndarray:
     """Return the least cost over the moves from the cells of one angle, (positions, positions)."""
     rows, columns, angles = values.shape
     margin = int(np.abs(moves.shift[:, :2]).max(initial=0))
     padded = np.full((rows + 2 * margin, columns + 2 * margin, angles), NEVER, np.float32)
     padded[margin : margin + rows, margin : margin + columns] = np.where(blocked, NEVER, values)
     best = np.full((rows, columns), NEVER, np.float32)
-    for (i, j, turn), cost, is_allowed in zip(moves.shift, moves.cost, allowed, strict=True):
+    for (i, j, turn), cost, is_allowed in zip(*moves, strict=True):
         shifted = padded[margin + i : margin + i + rows, margin + j : margin + j + columns, (k + turn) % angles]
         np.minimum(best, np.where(is_allowed, shifted + cost, NEVER), out=best)
     return best

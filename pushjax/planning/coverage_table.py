@@ -26,7 +26,7 @@ class Measure(Protocol):
 
     @property
     def reach(self) -> float:
-        """Upper bound of the distance from the goal at which the score can be `enough`, m, as of `pose_features`."""
+        """Upper bound of the distance from the goal (`PushLibrary.features`) at which the score can be `enough`, m."""
         ...
 
     def __call__(self, errors: np.ndarray) -> np.ndarray:

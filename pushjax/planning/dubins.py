@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax._internal.checks import ArrayLike, check_finite
+from pushjax._internal.checks import ArrayLike
 
 WORDS = ("LSL", "LSR", "RSL", "RSR", "LRL", "RLR")
 SIGN = {"L": 1.0, "S": 0.0, "R": -1.0}
@@ -59,17 +59,8 @@ def dubins(
     right: float,  # of the tightest right turn
 ) -> DubinsPath | None:
     """Find the shortest path between two poses that goes forward, or None if it can turn to neither side."""
-    poses = []
-    for name, value in (("start", start), ("goal", goal)):
-        pose = np.asarray(value, np.float64)
-        if pose.shape != (3,):
-            raise ValueError(f"{name} has shape {pose.shape}; expected (3,)")
-        check_finite(name, pose)
-        poses.append(pose)
-    for name, radius in (("left", left), ("right", right)):
-        if not radius > 0:
-            raise ValueError(f"{name} must be a positive radius; got {radius!r}")
-    radii = {"L": float(left), "R": float(right)}
+    poses = np.asarray(start, np.float64), np.asarray(goal, np.float64)
+    radii = {"L": left, "R": right}
     best: DubinsPath | None = None
     for word in WORDS:
         if all(np.isfinite(radii[turn]) for turn in word if turn != "S"):

@@ -82,10 +82,9 @@ class SpringDamper:
         return action[..., None, :] + by_position * away + by_velocity * state.velocity
 
     def after(self, state: FingerState, action: np.ndarray) -> FingerState:
-        position_row, velocity_row = self.powers[-1]
-        away = state.position - action
-        position = action + position_row[0] * away + position_row[1] * state.velocity
-        return FingerState(position, velocity_row[0] * away + velocity_row[1] * state.velocity)
+        by_position, by_velocity = self.powers[-1, 1]
+        velocity = by_position * (state.position - action) + by_velocity * state.velocity
+        return FingerState(self.motion(state, action)[..., -1, :], velocity)
 
 
 class SpeedLimits(NamedTuple):

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from pushjax.geometry.se2_numpy import compose, to_world
 from pushjax.planning.obstacles import OVERLAP_TOLERANCE
@@ -46,18 +47,12 @@ class PoseGrid(NamedTuple):
 
     def __call__(self, poses: np.ndarray) -> np.ndarray:
         """Return the value of poses (..., 3) by linear interpolation, (...,)."""
-        cells = self._cells(poses)
-        rows, columns, angles = self.values.shape
-        # a little less than the last cell, so that the next higher one exists
-        cells[..., :2] = np.clip(cells[..., :2], 0, np.array([rows - 1.001, columns - 1.001]))
-        low = np.floor(cells).astype(np.int32)
-        part = cells - low
-        total = np.zeros(cells.shape[:-1])
-        for corner in np.ndindex(2, 2, 2):
-            i, j, k = np.moveaxis(low + np.array(corner), -1, 0)
-            weight = np.prod(np.where(corner, part, 1 - part), axis=-1)
-            total = total + weight * self.values[i, j, k % angles]
-        return total
+        i, j, k = np.moveaxis(self._cells(poses), -1, 0)
+        # the first angle comes again after the last one, so that every angle lies between two
+        values = np.pad(self.values, ((0, 0), (0, 0), (0, 1)), "wrap")
+        cells = np.stack([i, j, k % self.values.shape[2]])
+        found = map_coordinates(values, cells.reshape(3, -1), np.float64, order=1, mode="nearest")
+        return found.reshape(poses.shape[:-1])
 
     def _cells(self, poses: np.ndarray) -> np.ndarray:
         """Return positions in the grid, in units of cells, (..., 3)."""
@@ -100,24 +95,20 @@ class FreeSpace:
             )
         self.slider_clearance = min(clearance, max(at_goal, 0.0))  # of the slider, m
 
-    def slider_distance(self, poses: np.ndarray) -> np.ndarray:
+    def slider_distance(self, poses: np.ndarray, stride: int = 1) -> np.ndarray:
         """Return the distance of the slider from obstacles at poses (..., 3), as `Obstacles.slider_clearance` does."""
-        return self._distance_of(self.vertices, poses)
-
-    def _distance_of(self, vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Return the distance of a polygon, (vertices, 2), from obstacles at poses (..., 3), m."""
+        # with the outline of every so many of the vertices
         tolerance = OVERLAP_TOLERANCE * self.length
-        return self.obstacles.slider_clearance(vertices, poses, 2 * self.clearance, tolerance)
+        return self.obstacles.slider_clearance(self.vertices[::stride], poses, 2 * self.clearance, tolerance)
 
     @cached_property
     def distances(self) -> PoseGrid:
         """`slider_distance` on a grid of poses, for an outline of at most `MAX_VERTICES` vertices."""
         axes = [low + self.spacing * np.arange(self.positions) for low in self.low]
         theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
-        outline = self.vertices[:: -(-len(self.vertices) // MAX_VERTICES)]
-        values = [
-            self._distance_of(outline, np.stack(np.meshgrid(*axes, [each], indexing="ij"), axis=-1)) for each in theta
-        ]
+        stride = -(-len(self.vertices) // MAX_VERTICES)
+        cells = (np.stack(np.meshgrid(*axes, [each], indexing="ij"), axis=-1) for each in theta)
+        values = [self.slider_distance(each, stride) for each in cells]
         return PoseGrid(self.low, self.spacing, np.concatenate(values, axis=-1).astype(np.float32))
 
     @cached_property
@@ -163,20 +154,13 @@ class FreeSpace:
         push, index = library.entries[entries].T
         steps = np.minimum(np.arange(0, index.max(initial=0) + EXACT_STRIDE, EXACT_STRIDE), index[:, None])
         ends = library.starts[push] + library.travel[index, None] * library.directions[push]
-        reached = compose(poses[:, None], library.outcomes[0][push[:, None], steps])
         starts = to_world(poses, self.roadmap.goals[push])
-        return self._run_up_may_start(starts) & self._keeps_distance(reached, starts, to_world(poses, ends))
-
-    def _keeps_distance(self, poses: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return whether slider and finger keep their distance from obstacles in pushes, (pushes,)."""
-        # `poses` (pushes, poses, 3) are those of the slider; the finger moves from `start` to `end`, (pushes, 2), all
-        # in the world. A slider that is too near to an obstacle at first must come no nearer, and must be farther away
-        # at the end.
-        distance = self.slider_distance(poses)
+        kept = self._run_up_may_start(starts) & self.finger_free(starts, to_world(poses, ends), self.clearance)
+        # A slider that is too near to an obstacle at first must come no nearer, and must be farther away at the end.
+        distance = self.slider_distance(compose(poses[:, None], library.outcomes[0][push[:, None], steps]))
         before, required = distance[:, 0], self.slider_clearance
-        kept = distance.min(1) >= np.minimum(required, before - OVERLAP_TOLERANCE * self.length)
-        kept &= distance[:, -1] >= np.minimum(required, before + MIN_RETREAT * self.length)
-        return kept & self.finger_free(start, end, self.clearance)
+        kept &= distance.min(1) >= np.minimum(required, before - OVERLAP_TOLERANCE * self.length)
+        return kept & (distance[:, -1] >= np.minimum(required, before + MIN_RETREAT * self.length))
 
     def finger_free(self, start: np.ndarray, end: np.ndarray, clearance: float = 0.0) -> np.ndarray:
         """Return whether the finger keeps a clearance from obstacles along segments (..., 2), world, m."""

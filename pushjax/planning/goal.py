@@ -49,18 +49,12 @@ class Goal(eqx.Module):
         angle_tolerance: Tolerance of the angle, rad.
         length: Length that weighs the angle in `distance`, m.
         symmetry: Number of angles in a full turn at which the slider looks the same (4 for a square), or a list of the
-            turns after which it does, (turns,), rad. The list must contain zero, or else `pose` itself is no goal.
-
-    Attributes:
-        pose: The pose, (3,), world, m and rad.
-        position_tolerance: Tolerance of the position, m.
-        angle_tolerance: Tolerance of the angle, rad.
-        length: Length that weighs the angle, m.
-        turns: Turns after which the slider looks the same, (turns,), rad.
+            turns after which it does, (turns,), rad. The list must contain zero, or else `pose` itself is no goal. The
+            attribute is the list, `turns`.
 
     Raises:
         ValueError: For a pose or turns of a wrong shape, for a tolerance or a length that is not positive, for values
-            that are not finite, and for a symmetry below one.
+            that are not finite, and for a symmetry below one. All methods raise it for poses of another shape.
 
     Examples:
         >>> goal = Goal((0.1, 0.0, 0.0), symmetry=4)
@@ -99,9 +93,6 @@ class Goal(eqx.Module):
         Returns:
             Differences (x, y, theta), (..., 3), world, m and rad. The angle is at most half a turn, and its derivative
             is one everywhere. Where two equivalent goals are equally near, the angle is from one of them.
-
-        Raises:
-            ValueError: For poses of another shape.
         """
         given = as_float(pose, common_dtype(pose, self.pose), "pose")
         if given.ndim == 0 or given.shape[-1] != 3:
@@ -119,9 +110,6 @@ class Goal(eqx.Module):
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
-
-        Raises:
-            ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
         squared = offset[..., 0] ** 2 + offset[..., 1] ** 2
@@ -136,9 +124,6 @@ class Goal(eqx.Module):
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
-
-        Raises:
-            ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
         return norm(offset[..., :2]) + self.length * _absolute(offset[..., 2])
@@ -150,9 +135,6 @@ class Goal(eqx.Module):
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
-
-        Raises:
-            ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
         return jnp.maximum(
@@ -164,9 +146,6 @@ class Goal(eqx.Module):
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
-
-        Raises:
-            ValueError: For poses of another shape.
         """
         return self.max_error(pose) <= 1
 

@@ -5,10 +5,15 @@ hundred thousand outcomes and the few pushes that correct a push while it runs s
 once.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from pushjax._internal.checks import ArrayLike
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.geometry.shape import Shape
@@ -21,36 +26,41 @@ LEG = 32  # steps of a leg
 
 
 def simulate_pushes(
-    slider: Slider,  # leaves of its surface may have a leading axis of pushes
+    slider: Slider,
     hand: Hand,
     paths: np.ndarray,  # (pushes, steps + 1, dof), world; steps are not divided, so their size sets the accuracy
     poses: np.ndarray,  # (pushes, 3), of the slider at the start, world, m and rad
-    friction: np.ndarray | float,  # of the contacts; one for all pushes or (pushes,)
+    friction: ArrayLike,  # of the contacts, ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate pushes of one slider along paths."""
     # Returns poses of the slider along each path, (pushes, steps + 1, 3), world, m and rad, and the number of steps
     # before the first one that failed or stopped, (pushes,).
     count, steps = len(paths), paths.shape[1] - 1
     dtype = np.dtype(jnp.result_type(float))
-    # The last push is repeated to fill its group. To fill the last leg, the hand rests at the end of its path.
-    rows = np.minimum(np.arange(-(-count // GROUP) * GROUP), count - 1)
-    columns = np.minimum(np.arange(-(-steps // LEG) * LEG + 1), steps)
-    paths = np.asarray(paths, dtype)[rows][:, columns]
-    mu = np.broadcast_to(np.asarray(friction, dtype), (count,))[rows]
-    surfaces = jax.tree.map(lambda leaf: leaf[rows], _one_surface_each(slider.surface, count))
-    found = np.empty((len(rows), len(columns), 3), dtype)
-    found[:, 0] = np.asarray(poses, dtype)[rows]
-    valid_steps = np.full(len(rows), steps)
-    for first in range(0, len(rows), GROUP):
-        group = slice(first, first + GROUP)
-        surface = jax.tree.map(lambda leaf, group=group: leaf[group], surfaces)
-        for begin in range(0, steps, LEG):
-            leg, start = paths[group, begin : begin + LEG + 1], found[group, begin]
-            reached, valid = map(np.asarray, _simulate_group(slider.shape, hand, surface, mu[group], leg, start))
-            found[group, begin + 1 : begin + LEG + 1] = reached[:, 1:]
-            until = np.where(valid < LEG, begin + valid, steps)
-            valid_steps[group] = np.minimum(valid_steps[group], until)
-    return found[:count, : steps + 1], valid_steps[:count]
+    columns = np.minimum(np.arange(-(-steps // LEG) * LEG + 1), steps)  # in the last leg the hand may rest at the end
+    paths = np.asarray(paths, dtype)[:, columns]
+    mu = np.full(GROUP, friction, dtype)
+    surfaces = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (GROUP, *leaf.shape)), slider.surface)
+    found = np.empty((count, len(columns), 3), dtype)
+    found[:, 0] = poses
+    valid_steps = np.full(count, steps)
+    for begin in range(0, steps, LEG):
+        leg = slice(begin, begin + LEG + 1)
+
+        def simulate(rows: np.ndarray, leg: slice = leg) -> tuple[Array, Array]:
+            return _simulate_group(slider.shape, hand, surfaces, mu, paths[rows, leg], found[rows, leg.start])
+
+        found[:, leg], valid = in_batches(count, GROUP, simulate)
+        valid_steps = np.minimum(valid_steps, np.where(valid < LEG, begin + valid, steps))
+    return found[:, : steps + 1], valid_steps
+
+
+def in_batches(count: int, size: int, program: Callable[[np.ndarray], Any]) -> Any:
+    """Call a program with the indices below `count`, `size` at a time, and join the rows of its results, in NumPy."""
+    # The last batch is filled up with indices from zero on, so that one compiled program serves any number.
+    batches = -(-count // size)
+    found = [program(rows) for rows in np.split(np.arange(batches * size) % count, batches)]
+    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *found)
 
 
 @quick_jit
@@ -63,10 +73,3 @@ def _simulate_group(shape: Shape, hand: Hand, surfaces: LimitSurface, friction, 
         return push.pose, jnp.where(push.first_failure >= 0, jnp.minimum(push.first_failure, stops), stops)
 
     return jax.vmap(simulate)(surfaces, friction, paths, poses)
-
-
-def _one_surface_each(surface: LimitSurface, count: int) -> LimitSurface:
-    """Return the surface with a leading axis of pushes on each leaf."""
-    if surface.length.ndim == 1:
-        return jax.tree.map(np.asarray, surface)
-    return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (count, *leaf.shape)), surface)

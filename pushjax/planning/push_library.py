@@ -6,7 +6,7 @@ by B, a and then b move it from pose q to compose(compose(q, A), B).
 
 A slider at pose q is brought to the goal g by one push if the push's outcome is the relative pose compose(inverse(q),
 g). So one k-d tree of all outcomes answers from which poses one push reaches any goal, and all plans of two pushes are
-one query with the poses that first pushes lead to. The distance in the tree is that of `pose_features`; it is not
+one query with the poses that first pushes lead to. The distance in the tree, that of `PushLibrary.features`, is not
 changed by a motion of the world, so it is the distance of the final pose from the goal.
 """
 
@@ -30,7 +30,7 @@ from pushjax._internal.checks import check_count
 from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.push_batch import simulate_pushes
-from pushjax.planning.scene import PushScene, draw_friction
+from pushjax.planning.scene import PushScene, draw_friction, mean_friction
 from pushjax.simulation.slider import Slider
 
 # Lengths in units of the surface's length, which is about the slider's radius.
@@ -185,8 +185,12 @@ class PushLibrary:
         return KDTree(self.features(self.relative), balanced_tree=False, compact_nodes=False)
 
     def features(self, poses: np.ndarray) -> np.ndarray:
-        """Return `pose_features` about this slider's centroid, (..., 4)."""
-        return pose_features(poses, self.center, self.length)
+        """Return four features of poses (..., 3) whose Euclidean distance is a distance of poses, (..., 4), m."""
+        # They are the position of the centroid, and `length` times cosine and sine of the angle. So angles that differ
+        # by a full turn are the same, and for small differences the distance is sqrt(dx^2 + dy^2 + (length dtheta)^2).
+        center, theta = to_world(poses, self.center.astype(poses.dtype)), poses[..., 2]
+        direction = self.length * np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+        return np.concatenate([center, direction.astype(poses.dtype)], axis=-1)
 
     def averaged(self, weight: np.ndarray | None = None) -> "PushLibrary":
         """Return the library whose only sample is the mean outcome of each push.
@@ -194,17 +198,12 @@ class PushLibrary:
         Args:
             weight: Weights of the samples, (samples,), which add up to one. None: all alike.
         """
-        if len(self.outcomes) == 1:
+        if (count := len(self.outcomes)) == 1:
             return self
-        mean = np.tensordot(self._weights(weight), self.outcomes, 1)
-        return replace(self, outcomes=mean[None])
-
-    def _weights(self, weight: np.ndarray | None) -> np.ndarray:
-        count = len(self.outcomes)
         weights = np.full(count, 1 / count, np.float32) if weight is None else np.asarray(weight, np.float32)
         if weights.shape != (count,):
             raise ValueError(f"weight has shape {weights.shape}; expected ({count},), the samples of the library")
-        return weights
+        return replace(self, outcomes=np.tensordot(weights, self.outcomes, 1)[None])
 
     def nearest(self, relative: np.ndarray, count: int, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries whose outcomes are nearest to relative poses.
@@ -225,19 +224,6 @@ class PushLibrary:
             distance_upper_bound=max_distance,
         )
         return np.asarray(distance), np.asarray(index)
-
-
-def pose_features(poses: np.ndarray, center: np.ndarray, length: float) -> np.ndarray:
-    """Return four features of poses (..., 3) whose Euclidean distance is a distance of poses, (..., 4), m."""
-    # They are the position of `center`, (2,), body frame, and `length`, m, times cosine and sine of the angle. So
-    # angles that differ by a full turn are the same, and for small differences the distance is sqrt(dx^2 + dy^2 +
-    # (length dtheta)^2).
-    theta = poses[..., 2]
-    center_position = to_world(poses, np.asarray(center, poses.dtype))
-    return np.concatenate(
-        [center_position, np.stack([length * np.cos(theta), length * np.sin(theta)], axis=-1).astype(poses.dtype)],
-        axis=-1,
-    )
 
 
 def fan(
@@ -273,14 +259,11 @@ def _simulated(
     steps = round(TRAVEL / STEP)
     travel = length * STEP * np.arange(steps + 1)
     paths = starts[:, None] + travel[:, None] * directions[:, None]
-    if key is None:
-        surfaces, mus = [slider.surface], [scene.mean_friction]
-    else:
-        draws = draw_friction(key, slider.surface, scene.friction, samples)
-        surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k, 0], draws.surface) for k in range(samples)]
-        mus = np.asarray(draws.friction[:, 0]).tolist()
+    given = slider.surface, scene.friction
+    draws = mean_friction(*given) if key is None else draw_friction(key, *given, samples)
     outcomes, valid, start = [], np.ones((len(starts), steps + 1), bool), np.zeros((len(starts), 3))
-    for surface, mu in zip(surfaces, mus, strict=True):
+    for k in range(samples):
+        surface, mu = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k, 0], (draws.surface, draws.friction))
         poses, valid_steps = simulate_pushes(Slider(slider.shape, surface), scene.hand, paths, start, mu)
         moved = np.linalg.norm(poses * np.array([1, 1, length]), axis=-1)
         valid &= (np.arange(steps + 1) <= valid_steps[:, None]) & (moved > LEAST_MOTION * length)

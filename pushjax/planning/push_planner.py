@@ -228,15 +228,10 @@ class PushPlanner:
         entries = np.asarray(near, int)
         entries = entries[np.isfinite(transit_time[self.push[entries]])]
         entries = entries[self.workspace.allows_finger(to_world(pose, self.ends[entries]))]
-        if not len(entries):
-            return None
         back = np.broadcast_to(inverse(relative), (len(entries), 3))
         spent = transit_time[self.push[entries]] + self.push_time[entries]
         cost = self._with_risk(spent, back, entries, must_reach=True)
-        best = self._least(cost, (np.broadcast_to(pose, back.shape), entries))
-        if best is None:
-            return None
-        return PushChoice(PushStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
+        return self._least(PushStatus.ONE_PUSH, cost, self.goal, (pose, entries))
 
     def _with_risk(self, spent: np.ndarray, back: np.ndarray, entries: np.ndarray, *, must_reach: bool) -> np.ndarray:
         """Return the costs of last pushes, with their risk; infinite for some that cannot have the least cost."""
@@ -279,10 +274,7 @@ class PushPlanner:
         if two is not None:
             return two
         total = spent + self._estimate(reached, quick=False)
-        k = self._least(total, (np.broadcast_to(pose, reached.shape), entries))
-        if k is None:
-            return None
-        return PushChoice(PushStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))
+        return self._least(PushStatus.COST_TO_GO, total, reached, (pose, entries))
 
     def _first_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries that can come next, and the poses that they lead to."""
@@ -317,8 +309,6 @@ class PushPlanner:
         wanted = compose(inverse(reached), self.goal.astype(np.float32))
         distance, second = self.indexed_library.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
         first, column = np.nonzero(np.isfinite(distance))
-        if not len(first):
-            return None
         second = second[first, column]
         starts = self.mean_library.starts[self.push[second]].astype(np.float32)
         allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
@@ -326,23 +316,24 @@ class PushPlanner:
         between = self._transit_time[self._end_place[entries[first]], self.push[second]]
         total = np.where(allowed, spent[first] + between + self.push_time[second], np.inf)
         total = self._with_risk(total, inverse(wanted[first]), second, must_reach=False)
-        k = self._least(total, (np.broadcast_to(pose, wanted[first].shape), entries[first]), (reached[first], second))
-        if k is None:
-            return None
-        best = first[k]
-        return PushChoice(PushStatus.TWO_PUSHES, int(entries[best]), reached[best].astype(float), float(total[k]))
+        pushes = (pose, entries[first]), (reached[first], second)
+        return self._least(PushStatus.TWO_PUSHES, total, reached[first], *pushes)
 
-    def _least(self, cost: np.ndarray, *pushes: tuple[np.ndarray, np.ndarray]) -> int | None:
-        """Return the index of the least finite cost of a choice whose pushes are all free, or None."""
-        # `pushes` are the poses of the slider before each push, (choices, 3), and its entries, (choices,). Only the
-        # `MAX_COLLISION_CHECKS` choices of least cost are considered.
-        order = np.argsort(cost, kind="stable")[:MAX_COLLISION_CHECKS]
+    def _least(
+        self, status: PushStatus, cost: np.ndarray, target: np.ndarray, *pushes: tuple[np.ndarray, np.ndarray]
+    ) -> PushChoice | None:
+        """Return the choice of least finite cost, (choices,), whose pushes are all free, or None."""
+        # `target` is the pose that each choice is for, (choices, 3) or the same for all, and so are the poses of the
+        # slider before each of the `pushes`; beside these are its entries, (choices,). Only the `MAX_COLLISION_CHECKS`
+        # choices of least cost are considered.
+        space, order = self.space, np.argsort(cost, kind="stable")[:MAX_COLLISION_CHECKS]
         order = order[np.isfinite(cost[order])]
-        if self.space is None:
-            return int(order[0]) if len(order) else None
         for some in np.split(order, range(COLLISION_BATCH, len(order), COLLISION_BATCH)):
-            free = [self.space.free(self.mean_library, poses[some], entries[some]) for poses, entries in pushes]
-            free = np.all(free, axis=0)
+            free = np.ones(len(some), bool)
+            for poses, entries in pushes if space is not None else ():
+                free &= space.free(self.mean_library, np.broadcast_to(poses, (len(cost), 3))[some], entries[some])
             if free.any():
-                return int(some[np.argmax(free)])
+                best = some[np.argmax(free)]
+                aim = np.broadcast_to(target, (len(cost), 3))[best].astype(float)
+                return PushChoice(status, int(pushes[0][1][best]), aim, float(cost[best]))
         return None

@@ -177,8 +177,8 @@ def _predicted(
 ) -> PushPlan:
     """Predict where a candidate ends under unseen friction, and find the transits of the finger between its pushes."""
     paths, poses = lay_out(parameters[None], problem)
-    _, failed, reached = samples_of(paths, unseen)
-    path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(reached[0], failed[0]))
+    _, found = samples_of(paths, unseen)
+    path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(found.poses[0], found.failed[0]))
     good = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed)
     transits, has_transits = (), True
     if (scene := problem.scene).has_one_finger:
@@ -206,11 +206,9 @@ def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tu
 
 def _hand_in_fixture(problem: PushProblem, path: np.ndarray) -> bool:
     """Return whether a finger runs into a fixture along paths, (pushes, steps + 1, dof)."""
-    hand, fixtures = problem.scene.hand, problem.scene.fixtures
-    if not fixtures:
-        return False
+    hand = problem.scene.hand
     centers = np.asarray(hand.poses(jnp.asarray(path)), float)[..., :2]
-    apart = Obstacles.of(fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
+    apart = Obstacles.of(problem.scene.fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
     return bool(np.any(apart < np.asarray(hand.radius)))
 
 
@@ -240,10 +238,11 @@ def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarra
     given = checked_array("finger", finger, (2,), problem.start.dtype)
     center, radius = np.asarray(given, float), problem.scene.hand.radius[0]
     in_body = to_body(np.asarray(mean_pose(problem.start), float), center)
-    from_slider = float(signed_distances(outline_vertices(problem.scene.slider.shape), in_body) - radius)
-    if from_slider < 0:
-        raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-from_slider:.3g} m")
-    from_fixtures = float(Obstacles.of(problem.scene.fixtures).point_clearance(center) - radius)
-    if from_fixtures < 0:
-        raise ValueError(f"finger must not overlap a fixture at the start; got an overlap of {-from_fixtures:.3g} m")
+    apart = {
+        "the slider": signed_distances(outline_vertices(problem.scene.slider.shape), in_body),
+        "a fixture": Obstacles.of(problem.scene.fixtures).point_clearance(center),
+    }
+    for name, distance in apart.items():
+        if (overlap := float(radius - distance)) > 0:
+            raise ValueError(f"finger must not overlap {name} at the start; got an overlap of {overlap:.3g} m")
     return center

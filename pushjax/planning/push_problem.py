@@ -22,6 +22,7 @@ from pushjax._internal.jit import jit, quick_jit
 from pushjax.metrics import mean_pose
 from pushjax.planning.costs import Cost, Risk
 from pushjax.planning.goal import Goal
+from pushjax.planning.push_batch import in_batches
 from pushjax.planning.push_sequence import PushSequence
 from pushjax.planning.scene import PushScene, draw_friction, mean_friction
 from pushjax.planning.search import Objective
@@ -47,14 +48,6 @@ class Outcomes(NamedTuple):
     def success(self, goal: Goal) -> float:
         """Return the fraction of the samples that reach a goal."""
         return float(np.mean(np.asarray(goal.reached(self.pose)) & ~np.asarray(self.failed)))
-
-
-class Sample(NamedTuple):
-    """What a candidate does under one sample of friction."""
-
-    cost: Float[Array, ""]
-    failed: Bool[Array, ""]  # whether a rollout failed
-    poses: Float[Array, "pushes+1 3"]  # of the slider before the first push and after each, world, m and rad
 
 
 class PushProblem(eqx.Module):
@@ -86,19 +79,16 @@ class PushProblem(eqx.Module):
         shape, hand, fixtures = self.scene.slider.shape, self.scene.hand, self.scene.fixtures
         return rollout_under_draws(draw, shape, hand, path, pose, None, None, None, fixtures)
 
-    def rollouts(self, draw: Draws, paths: Array, pose: Array) -> Trajectory:
-        """Push several times; the result has a leading axis of pushes."""
+    def sample(self, paths: Array, draw: Draws, pose: Array) -> tuple[Float[Array, ""] | None, Outcomes]:
+        """Push along paths, (pushes, steps + 1, dof), under sampled friction; the cost is None without a `Cost`."""
 
         def push(pose: Array, path: Array) -> tuple[Array, Trajectory]:
             done = self.rollout(draw, path, pose)
             return done.pose[-1], done
 
-        return jax.lax.scan(push, pose, paths)[1]
-
-    def sample(self, paths: Array, draw: Draws, pose: Array) -> Sample:
-        """Push along paths under sampled friction."""
-        done = self.rollouts(draw, paths, pose)
-        return Sample(self.cost(done), jnp.any(done.failed), jnp.concatenate([pose[None], done.pose[:, -1]]))
+        done = jax.lax.scan(push, pose, paths)[1]
+        outcomes = Outcomes(jnp.concatenate([pose[None], done.pose[:, -1]]), jnp.any(done.failed))
+        return None if self.cost is None else self.cost(done), outcomes
 
     def total(self, costs: Array, failed: Array) -> Float[Array, ""]:
         """Return the cost of one candidate from its samples."""
@@ -108,68 +98,35 @@ class PushProblem(eqx.Module):
 
 # Candidates are evaluated by two programs, with one rollout each: compiling rollouts takes most of the time of a plan.
 # Both have one size, whatever the number of candidates and samples.
-
-
-@quick_jit
-def _lay_outs(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
-    return jax.vmap(problem.lay_out)(parameters)
-
-
-@jit
-def _samples(paths: Array, draws: Draws, start: Array, problem: PushProblem) -> Sample:
-    return jax.vmap(problem.sample)(paths, draws, start)
-
-
-@jit
-def _totals(costs: Array, failed: Array, problem: PushProblem) -> Array:
-    return jax.vmap(problem.total)(costs, failed)
+_lay_outs = quick_jit(jax.vmap(PushProblem.lay_out, in_axes=(None, 0)))
+_samples = jit(jax.vmap(PushProblem.sample, in_axes=(None, 0, 0, 0)))
+_totals = jit(jax.vmap(PushProblem.total, in_axes=(None, 0, 0)))
+_simulated = quick_jit(jax.vmap(PushProblem.sample, in_axes=(None, None, 0, 0)))
 
 
 def lay_out(parameters: np.ndarray, problem: PushProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return the paths of candidates (candidates, pushes, ...), and the poses that they lead to; see `PushProblem`."""
-    rows, shared = _in_batches(len(parameters), CANDIDATES_AT_A_TIME), _without_samples(problem)
-    given = np.asarray(parameters, problem.start.dtype)
-    return _joined([_lay_outs(jnp.asarray(given[each]), shared) for each in rows], len(parameters))
+    given, shared = np.asarray(parameters, problem.start.dtype), _without_samples(problem)
+    return in_batches(len(given), CANDIDATES_AT_A_TIME, lambda rows: _lay_outs(shared, jnp.asarray(given[rows])))
 
 
-def samples_of(paths: np.ndarray, problem: PushProblem) -> Sample:
+def samples_of(paths: np.ndarray, problem: PushProblem) -> tuple[np.ndarray, Outcomes]:
     """Push along the paths of candidates in all samples; the arrays have the leading axes (candidates, samples)."""
     draws, start = jax.tree.map(np.asarray, (problem.draws, problem.start))
     candidates, samples, shared = len(paths), len(start), _without_samples(problem)
-    found = []
-    for rows in _in_batches(candidates * samples, SAMPLES_AT_A_TIME):
+
+    def simulate(rows: np.ndarray) -> Any:
         candidate, sample = rows // samples, rows % samples
-        draw = jax.tree.map(lambda leaf, at=sample: leaf[at], draws)
-        found.append(_samples(jnp.asarray(paths[candidate]), draw, jnp.asarray(start[sample]), shared))
-    found = _joined(found, candidates * samples)
+        draw = jax.tree.map(lambda leaf: leaf[sample], draws)
+        return _samples(shared, jnp.asarray(paths[candidate]), draw, jnp.asarray(start[sample]))
+
+    found = in_batches(candidates * samples, SAMPLES_AT_A_TIME, simulate)
     return jax.tree.map(lambda leaf: leaf.reshape(candidates, samples, *leaf.shape[1:]), found)
 
 
 def _without_samples(problem: PushProblem) -> PushProblem:
     """Return the problem without its samples, which is the same for all stages of a search."""
     return replace(problem, draws=None, start=mean_pose(problem.start)[None])
-
-
-def _in_batches(count: int, size: int) -> list[np.ndarray]:
-    """Return the indices below `count` in arrays of one size, the last one filled up with indices from zero on."""
-    batches = -(-count // size)
-    return np.split(np.arange(batches * size) % count, batches)
-
-
-def _joined(batches: list[Any], count: int) -> Any:
-    """Return the first rows of the arrays of all batches, in NumPy."""
-    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *batches)
-
-
-@quick_jit
-def simulated(paths: Array, problem: PushProblem) -> Outcomes:
-    """Simulate paths of pushes, (pushes, steps + 1, dof), in all samples."""
-
-    def sample(draw: Draws, pose: Array) -> Outcomes:
-        done = problem.rollouts(draw, paths, pose)
-        return Outcomes(jnp.concatenate([pose[None], done.pose[:, -1]]), jnp.any(done.failed))
-
-    return jax.vmap(sample)(problem.draws, problem.start)
 
 
 def push_outcomes(
@@ -195,7 +152,7 @@ def push_outcomes(
     """
     problem = push_problem(key, scene, start, samples)
     paths = checked_array("path", path, ("pushes", "steps + 1", scene.hand.dof), problem.start.dtype)
-    return simulated(paths, problem)
+    return _simulated(problem, paths, problem.draws, problem.start)[1]
 
 
 def push_problem(
@@ -225,9 +182,12 @@ def objective(problem: PushProblem) -> Objective:
     """Return the cost of many candidates as a function on the host."""
 
     def cost(parameters: np.ndarray) -> np.ndarray:
-        found = samples_of(lay_out(parameters, problem)[0], problem)
-        rows, shared = _in_batches(len(parameters), CANDIDATES_AT_A_TIME), _without_samples(problem)
-        totals = [_totals(found.cost[each], found.failed[each], shared) for each in rows]
-        return _joined(totals, len(parameters)).astype(np.float64)
+        costs, found = samples_of(lay_out(parameters, problem)[0], problem)
+        shared = _without_samples(problem)
+
+        def total(rows: np.ndarray) -> Array:
+            return _totals(shared, jnp.asarray(costs[rows]), jnp.asarray(found.failed[rows]))
+
+        return in_batches(len(parameters), CANDIDATES_AT_A_TIME, total).astype(np.float64)
 
     return Objective(cost, problem.pushes.scale)

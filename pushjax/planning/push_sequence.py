@@ -6,13 +6,12 @@ goes on from there by a length. So contact point, direction and length are free,
 between its edges. With bends the path is a Bezier curve whose ends are those of the line.
 """
 
-from math import comb
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+from scipy.special import binom
 
 from pushjax._internal.checks import ArrayLike, check_count, checked_array
 from pushjax._math.vec import Vec2, Vec3
@@ -160,4 +159,4 @@ def _bernstein(degree: int, steps: int) -> np.ndarray:
     """Return the weights of the control points of a Bezier curve at equal steps, (steps + 1, degree + 1)."""
     t = np.arange(steps + 1)[:, None] / steps
     k = np.arange(degree + 1)[None]
-    return np.array([comb(degree, j) for j in range(degree + 1)])[None] * t**k * (1 - t) ** (degree - k)
+    return binom(degree, k) * t**k * (1 - t) ** (degree - k)

@@ -96,7 +96,8 @@ class Roadmap:
         body_start, obstacles = to_body(pose, np.asarray(start, float)), self.obstacles.in_frame(pose)
         begin, status = self._retreat(body_start, pose, workspace, obstacles)
         if status != TransitStatus.FOUND:
-            return self._no_transits(body_start, status)
+            none, blocked = np.full(len(self.goals), np.inf), self.goal_clearance < self.min_distance
+            return ShortestTransits(none, status, body_start[None], np.array([-1]), np.zeros(len(none), int), blocked)
         nodes, links = self._within(pose, workspace)
         if obstacles.any:
             nodes, links = self._among(nodes, links, pose, workspace, obstacles)
@@ -218,59 +219,34 @@ class Roadmap:
 
     def _retreat(self, start: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
         """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2), and the status."""
-        distance = float(signed_distances(self.vertices, start))
-        obstacle_distance = float(obstacles.point_clearance(start))
-        if distance >= self.min_distance and obstacle_distance >= self.min_obstacle_distance:
+        solids = (Obstacles((self.vertices,)), self.min_distance), (obstacles, self.min_obstacle_distance)
+        distances = [float(solid.point_clearance(start)) for solid, _ in solids]
+        missing = max(required - distance for distance, (_, required) in zip(distances, solids, strict=True))
+        if missing <= 0:
             return start[None], TransitStatus.FOUND
-        if distance <= 0 or obstacle_distance <= 0:
-            return start[None], TransitStatus.START_IN_SLIDER if distance <= 0 else TransitStatus.START_IN_FIXTURE
-        missing = max(self.min_distance - distance, self.min_obstacle_distance - obstacle_distance)
+        if min(distances) <= 0:
+            return start[None], TransitStatus.START_IN_SLIDER if distances[0] <= 0 else TransitStatus.START_IN_FIXTURE
         angle = np.arange(RETREATS) * (2 * np.pi / RETREATS)
         # out of a wedge between polygon and obstacle it is farther
         reach = missing * np.array([1.0, 1.5, 2.0, 3.0, 5.0, 8.0][: 6 if obstacles.any else 4]) + 1e-3 * self.clearance
         ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
-        end_distance = signed_distances(self.vertices, ends)
-        early = start + 0.2 * (ends - start)
-        good = _recedes(
-            distance,
-            self.min_distance,
-            end_distance,
-            signed_distances(self.vertices, early),
-            segment_distances(self.vertices, start, ends, end_distance=end_distance),
-        )
-        if obstacles.any:
-            good &= _recedes(
-                obstacle_distance,
-                self.min_obstacle_distance,
-                obstacles.point_clearance(ends),
-                obstacles.point_clearance(early),
-                obstacles.segment_clearance(start, ends),
-            )
-        good &= workspace.allows_finger(to_world(pose, ends))
+        good = workspace.allows_finger(to_world(pose, ends))
+        for solid, required in solids:
+            good &= _recedes(solid, required, start, ends)
         if not good.any():
             return start[None], TransitStatus.NO_RETREAT
         best = np.argmin(np.where(good, np.linalg.norm(ends - start, axis=1), np.inf))
         return np.stack([start, ends[best]]), TransitStatus.FOUND
 
-    def _no_transits(self, start: np.ndarray, status: TransitStatus) -> ShortestTransits:
-        """Return the result for a start, (2,), body frame, from which the finger cannot leave."""
-        count = len(self.goals)
-        none = np.full(count, np.inf)
-        return ShortestTransits(
-            none, status, start[None], np.array([-1]), np.zeros(count, int), self.goal_clearance < self.min_distance
-        )
 
-
-def _recedes(
-    start: float,  # distance at the start, m
-    required: float,  # at the end, m; where the start has it, all of the segment must
-    end: np.ndarray,  # at the end of each segment, (segments,), m
-    early: np.ndarray,  # a little after the start; must have grown, to exclude segments that slide along an edge
-    least: np.ndarray,  # along each segment, (segments,), m
-) -> np.ndarray:
+def _recedes(solid: Obstacles, required: float, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Return whether segments end at the required distance or more, and are nowhere nearer than at their start."""
-    grows = True if start >= required else early > start + 0.02 * (required - start)
-    return grows & (least >= min(start, required) * (1 - 1e-9)) & (end >= required)
+    at_start = float(solid.point_clearance(start))
+    # A little after the start the distance must have grown, to exclude segments that slide along an edge.
+    early = solid.point_clearance(start + 0.2 * (ends - start))
+    grows = at_start >= required or early > at_start + 0.02 * (required - at_start)
+    least = solid.segment_clearance(start, ends)
+    return grows & (least >= min(at_start, required) * (1 - 1e-9)) & (solid.point_clearance(ends) >= required)
 
 
 def run_ups(

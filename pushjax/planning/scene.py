@@ -30,13 +30,7 @@ class PushScene(eqx.Module):
         slider: The slider; its limit surface is the mean one if friction is random.
         hand: The hand. Libraries and planners need one round finger, `pj.Hand.finger`.
         friction: Coefficient of contact friction, if it is known, and the limit surface too. Otherwise a
-            `pj.FrictionModel`, the distribution of both.
-        fixtures: Walls and fixed bodies.
-
-    Attributes:
-        slider: The slider.
-        hand: The hand.
-        friction: The `pj.FrictionModel`, also of friction that is known.
+            `pj.FrictionModel`, the distribution of both. The attribute is a model in both cases.
         fixtures: Walls and fixed bodies.
 
     Raises:

@@ -34,6 +34,7 @@ from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.planning.goal import ANGLE_TOLERANCE, PlanStatus, symmetric_turns
+from pushjax.planning.push_batch import in_batches
 from pushjax.planning.scene import draw_friction
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand
@@ -225,15 +226,12 @@ def squeeze_outcomes(
     poses = _checked(key, slider, hand, belief)
     placed = checked_array("jaws", jaws, ("squeezes", 3))
     draws = draw_friction(key, slider.surface, model, len(poses))
-    reached, all_held, all_failed = [poses], [], []
+    after, done = poses, []
     for jaw in np.asarray(placed, float):
-        after, held, failed = _squeezed(slider, hand, squeezes, draws, reached[-1], jaw)
-        reached.append(after)
-        all_held.append(held)
-        all_failed.append(failed)
-    none = np.zeros((len(poses), 0), bool)
-    held, failed = (np.stack(each, axis=1) if each else none for each in (all_held, all_failed))
-    return SqueezeOutcomes(np.stack(reached, axis=1), held, failed)
+        done.append(_squeezed(slider, hand, squeezes, draws, after, jaw))
+        after = done[-1][0]
+    reached, held, failed = (np.stack(each, axis=1) for each in zip(*done, strict=True))
+    return SqueezeOutcomes(np.concatenate([poses[:, None], reached], axis=1), held, failed)
 
 
 def distances(
@@ -294,15 +292,14 @@ def _squeezed(
     # are broadcast.
     poses, jaws = np.broadcast_arrays(poses, jaws[..., None, :])
     shape, dtype = poses.shape[:-1], np.dtype(common_dtype(slider, hand))
-    count, samples = int(np.prod(shape)), shape[-1]
     flat_poses, flat_jaws = poses.reshape(-1, 3).astype(dtype), jaws.reshape(-1, 3).astype(dtype)
-    numpy_draws = jax.tree.map(np.asarray, draws)
-    parts = []
-    for first in range(0, count, ROWS):
-        rows = np.minimum(np.arange(first, first + ROWS), count - 1)  # the last squeeze is repeated to fill the batch
-        draw = jax.tree.map(lambda leaf, rows=rows: leaf[rows % samples].astype(dtype), numpy_draws)
-        parts.append(_squeeze_rows(slider, hand, squeezes, draw, flat_poses[rows], flat_jaws[rows]))
-    after, held, failed = (np.concatenate([np.asarray(part[k]) for part in parts])[:count] for k in range(3))
+    numpy_draws = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), draws)
+
+    def squeeze(rows: np.ndarray) -> Any:
+        draw = jax.tree.map(lambda leaf: leaf[rows % shape[-1]], numpy_draws)
+        return _squeeze_rows(slider, hand, squeezes, draw, flat_poses[rows], flat_jaws[rows])
+
+    after, held, failed = in_batches(len(flat_poses), ROWS, squeeze)
     return after.reshape(*shape, 3).astype(float), held.reshape(shape), failed.reshape(shape)
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_type, checked_array
+from pushjax._internal.checks import ArrayLike, check_count, check_type, checked_array
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2_numpy import compose, inverse
@@ -105,8 +105,7 @@ def stable_contacts(
     check_type("hand", hand, Hand)
     if not 0 <= margin < 1:
         raise ValueError(f"margin must be at least 0 and below 1; got {margin!r}")
-    rest = np.asarray(as_float(opening, name="opening"), np.float64)
-    check_finite("opening", rest)
+    rest = np.asarray(checked_array("opening", opening, ("numbers",)), np.float64)
     front = hand_front(hand, rest, float(slider.surface.length))
     draws = jax.tree.map(lambda leaf: leaf[:, 0], draw_friction(key, slider.surface, model, samples))
     friction = draws.friction.astype(slider.surface.length.dtype)
@@ -190,9 +189,8 @@ def shortest_push(
     Raises:
         ValueError: For poses that are not finite or have another shape, and for fewer than three steps.
     """
-    ends = []
-    for name, value in (("start", start), ("goal", goal)):
-        ends.append(np.asarray(checked_array(name, value, (3,)), np.float64))
+    given = {"start": start, "goal": goal}
+    ends = [np.asarray(checked_array(name, value, (3,)), np.float64) for name, value in given.items()]
     if steps is not None:
         check_count("steps", steps)
         if steps < 3:

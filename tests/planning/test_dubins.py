@@ -64,10 +64,6 @@ def test_where_it_cannot_turn():
     np.testing.assert_array_equal(still.poses(3), np.tile([1.0, 2.0, 3.0], (4, 1)))
 
 
-def test_bad_input():
-    with pytest.raises(ValueError, match=r"goal has shape \(2,\); expected \(3,\)"):
-        dubins((0, 0, 0), (1, 2), 1.0, 1.0)
-    with pytest.raises(ValueError, match="left must be a positive radius; got 0"):
-        dubins((0, 0, 0), (1, 2, 3), 0, 1.0)
+def test_too_few_steps():
     with pytest.raises(ValueError, match="steps must be at least 3, one for each part of the path; got 2"):
         dubins((0, 0, 0), (1, 2, 1), 1.0, 1.0).poses(2)

@@ -1,6 +1,7 @@
 """Libraries of pushes: their outcomes, their composition, their files, and the cost to go."""
 
 import os
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from pushjax import planning
 from pushjax.geometry import se2, se2_numpy
 from pushjax.planning import FrictionFilter, PositionControl, PushController, PushLibrary, PushPlanner, Workspace
 from pushjax.planning.cost_to_go import cost_to_go
-from pushjax.planning.push_library import fan, pose_features
+from pushjax.planning.push_library import fan
 from pushjax.planning.workspace import BoundingBoxTable
 
 GOAL = np.array([0.25, 0.3, 0.7])
@@ -43,14 +44,15 @@ def test_numpy_poses_agree_with_se2():
     np.testing.assert_allclose(se2_numpy.to_body(a, se2_numpy.to_world(a, points)), points, atol=1e-12)
 
 
-def test_features_are_a_distance_of_poses():
+def test_features_are_a_distance_of_poses(library):
     rng = np.random.default_rng(1)
     center, length = np.array([0.03, -0.01]), 0.05
+    features = replace(library, center=center, length=length).features
     a, move = rng.normal(0, 1, (2, 3))
     near = a + 1e-5 * rng.normal(0, 1, 3)
 
     def apart(p, q):
-        return np.linalg.norm(pose_features(p, center, length) - pose_features(q, center, length))
+        return np.linalg.norm(features(p) - features(q))
 
     shift = se2_numpy.to_world(near, center) - se2_numpy.to_world(a, center)
     wanted = np.sqrt(np.sum(shift**2) + (length * (near[2] - a[2])) ** 2)
