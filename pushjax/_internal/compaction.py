@@ -62,9 +62,10 @@ def where_needed(
         return update_if(needed, lambda _: (rounds or compute)(*args), otherwise)
 
     def of_batch(batched, own, args):
+        needed, otherwise = own
         if rounds is not None:
-            return _compute_in_rounds(rounds, batched, *own, args)
-        return _compute_in_tiles(compute, batched, *own, args)
+            return _compute_in_rounds(rounds, batched, needed, otherwise, args)
+        return _compute_in_tiles(compute, batched, needed, otherwise, args)
 
     @eqx.filter_custom_jvp
     def chosen(needed, otherwise, args):
