@@ -9,25 +9,19 @@ of the edges, because edges that press against each other are nearly dependent.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from pushjax._math.arrays import combined, dot, products
 from pushjax._math.sums import repeated, summed
-from pushjax.contact.finish import Equations, Solution, in_units
+from pushjax.contact.finish import Answer, Equations, Solution, in_units
 from pushjax.contact.force_distribution import of_chosen, shared_weights
-from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem
+from pushjax.contact.scaled_problem import ScaledProblem
+from pushjax.contact.status import Status
 
 
-def differentiable_solution(
-    problem: ScaledProblem,
-    best: EdgeSet,
-    solved: Bool[Array, "*batch"],
-    loaded: Bool[Array, "edges *batch"],
-    indeterminate: Bool[Array, "*batch"],
-    dual: Float[Array, "3 *batch"],
-    twist: Float[Array, "3 *batch"],
-) -> Solution:
-    """The solution whose cone edges and twist (m, m, rad) are known; its values are right to roundoff."""
+def differentiable_solution(problem: ScaledProblem, answer: Answer) -> Solution:
+    """The solution whose cone edges and twist are known; its values are right to roundoff."""
+    best, solved, indeterminate = answer.best, answer.status == Status.MOVING, answer.indeterminate
     equations, _, basis = Equations.of(problem, best, solved)
     fixed, constant, basis = jax.lax.stop_gradient((problem, equations, basis))
     into_edges = jnp.where(constant.used[:, None], summed(basis[:, None] * constant.axes[None], 2), 0.0)  # (edge, axis)
@@ -36,7 +30,7 @@ def differentiable_solution(
     wrench = combined(constant.edges, best.weight)
     motion, length = fixed.surface.gradient(wrench), jnp.ones_like(fixed.length)
     squared = dot(motion, motion)
-    along = dot(motion, twist * jnp.stack([length, length, fixed.length])) / fixed.unit
+    along = dot(motion, answer.solution.twist * jnp.stack([length, length, fixed.length])) / fixed.unit
     factor = jnp.where(solved & (along > 0) & (squared > 0), along / jnp.where(squared > 0, squared, 1.0), 1.0)
     if problem.surface.degree == 4:
         factor = jnp.cbrt(factor)
@@ -44,7 +38,7 @@ def differentiable_solution(
     placeholder = jnp.zeros_like(beta).at[0].set(1)
     wrench = jnp.where(solved[None], combined(axes, beta), placeholder)
     own = of_chosen(problem.edges, best.edges, summed(into_edges * repeated(beta, 0, 3), 1))
-    shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench, dual)
+    shared = shared_weights(problem.edges, answer.loaded & indeterminate[None], wrench, answer.dual)
     weights = jnp.where(indeterminate[None], shared, own)
     return in_units(problem, solved, problem.surface.gradient(wrench), wrench, weights)
 

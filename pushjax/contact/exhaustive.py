@@ -42,7 +42,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from pushjax._internal.xla import tree_where
 from pushjax._math.arrays import dot
@@ -147,8 +147,8 @@ def _best(kinds: list[Solutions]) -> Found:
     power = jnp.where(accepted, solutions.power, 0.0)
     ties = accepted & (power >= (1 - 4 * tolerance) * jnp.max(power, axis=0, keepdims=True))
     smallest = jnp.min(jnp.where(ties, squared, jnp.inf), axis=0, keepdims=True)
-    index = jnp.argmax(ties & ((1 - 8 * tolerance) * squared <= smallest), axis=0)
-    best = jax.tree.map(lambda x: _of_set(x, index), solutions)
+    index = jnp.argmax(ties & ((1 - 8 * tolerance) * squared <= smallest), axis=0, keepdims=True)
+    best = jax.tree.map(lambda x: along(x, index.reshape(*(1,) * (x.ndim - 2), *index.shape), -2)[..., 0, :], solutions)
     difference = solutions.twist - best.twist[:, None]
     far = same_solution_tolerance(dtype) ** 2 * (squared + dot(best.twist, best.twist)[None])
     found = jnp.any(accepted, axis=0)
@@ -156,8 +156,3 @@ def _best(kinds: list[Solutions]) -> Found:
     chosen = EdgeSet(edges, conditions, best.chosen.weight)
     second_found = jnp.any(accepted & (dot(difference, difference) > far), axis=0) & found
     return Found(chosen, second_found, jnp.any(passes & ~slow & too_fast, axis=0))
-
-
-def _of_set(x: Array, index: Int[Array, " batch"]) -> Array:
-    """The entries (..., batch) of one set of each example, from (..., sets, batch)."""
-    return along(x, jnp.expand_dims(index, tuple(range(x.ndim - 1))), -2).squeeze(-2)

@@ -195,6 +195,21 @@ class Solution(NamedTuple):
     force: Float[Array, "2 contacts *batch"]  # along (normal, tangent), N
 
 
+class Answer(NamedTuple):
+    """The answer to a contact problem."""
+
+    solution: Solution
+    mode: Int[Array, "contacts *batch"]  # `ContactMode`
+    status: Int[Array, "*batch"]  # `Status`
+    margin: Float[Array, "*batch"]  # minus the hand's squeeze power, m, as in `Motion`
+    unique: Bool[Array, "*batch"]  # False where the search found another twist that satisfies every condition
+    best: EdgeSet  # the cone edges that carry the force; the guess where there is no motion
+    loaded: Bool[Array, "edges *batch"]  # which edges carry force
+    indeterminate: Bool[Array, "*batch"]  # whether more edges share the force than the wrench determines
+    dual: Float[Array, "3 *batch"]  # y of `force_distribution`, where they do
+    squeeze_edges: Int[Array, "4 *batch"]  # edges of the equilibrium of the largest squeeze power
+
+
 def in_units(
     problem: ScaledProblem, solved: Bool[Array, "*batch"], twist: Array, wrench: Array, weights: Array
 ) -> Solution:

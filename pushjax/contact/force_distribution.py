@@ -23,7 +23,8 @@ from pushjax._math.sums import summed
 
 MAX_NEWTON_ITERATIONS = 7
 LINE_SEARCH_ITERATIONS = 5  # in each Newton iteration
-REGULARIZATION = 256  # what is added to the Hessian's diagonal, in units of eps times its trace
+# By the bytes of a float: what is added to the Hessian's diagonal, relative to its trace, 256 eps.
+REGULARIZATION = {4: 2.0**-15, 8: 2.0**-44}
 
 Vector = Float[Array, "3 *batch"]
 Weights = Float[Array, "edges *batch"]
@@ -135,21 +136,16 @@ def _dual_hessian(usable: Array, loaded: Bool[Array, "edges *batch"]) -> Float[A
     # without it, coplanar edges leave one direction of y undetermined, which F does not need
     chosen = jnp.where(loaded[None], usable, 0.0)
     hessian = summed(jnp.stack([chosen[i] * usable[j] for i, j in ENTRIES]), 1)
-    diagonal = _relative_regularization(usable.dtype) * (summed(hessian[:3], 0) + 1e-3)
+    diagonal = REGULARIZATION[usable.dtype.itemsize] * (summed(hessian[:3], 0) + 1e-3)
     is_diagonal = jnp.asarray([1.0, 1, 1, 0, 0, 0], usable.dtype).reshape(6, *(1,) * (usable.ndim - 2))
     return hessian + is_diagonal * diagonal[None]
-
-
-def _relative_regularization(dtype) -> float:
-    """The number added to the Hessian's diagonal, relative to its trace."""
-    return REGULARIZATION * float(jnp.finfo(dtype).eps)
 
 
 def _solve_regularized(m: Float[Array, "6 *batch"], v: Vector) -> Vector:
     """m^-1 v by elimination, with no pivot smaller than half of what was added to the diagonal."""
     # where the edges leave one or two directions undetermined, an adjugate would be nothing but roundoff
     xx, yy, zz, xy, xz, yz = m
-    min_pivot = _relative_regularization(v.dtype) / 2 * (xx + yy + zz)
+    min_pivot = REGULARIZATION[v.dtype.itemsize] / 2 * (xx + yy + zz)
     l2, l3 = xy / xx, xz / xx
     d2 = jnp.maximum(yy - l2 * xy, min_pivot)
     yz = yz - l2 * xz

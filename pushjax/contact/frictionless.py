@@ -11,7 +11,7 @@ jam the slider, although it might escape from so narrow a wedge, hundreds of tim
 """
 
 from itertools import combinations
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,19 +35,11 @@ class Frictionless(ContactSolver):
     proves_jams: ClassVar[bool] = True
 
     def search(self, problem: ScaledProblem) -> Found:
-        return Found.guessed(least_violation(problem).best)
+        return Found.guessed(least_violation(problem)[0])
 
 
-class LeastViolation(NamedTuple):
-    """The motion of each problem that violates its conditions least."""
-
-    best: EdgeSet
-    twist: Float[Array, "3 batch"]  # dimensionless
-    solved: Bool[Array, " batch"]
-
-
-def least_violation(problem: ScaledProblem) -> LeastViolation:
-    """Try every set of one, two or three contacts."""
+def least_violation(problem: ScaledProblem) -> tuple[EdgeSet, Float[Array, "3 batch"], Bool[Array, " batch"]]:
+    """The set of up to three contacts whose motion violates the conditions least, the twist, and whether it passes."""
     if problem.surface.degree != 2:
         raise ValueError(f"solver: Frictionless needs an ellipsoid; the surface has degree {problem.surface.degree}")
     m = problem.count
@@ -78,4 +70,4 @@ def least_violation(problem: ScaledProblem) -> LeastViolation:
     force, twist = (along(x, index[None], 1)[:, 0] for x in (force, twist))
     edges = jnp.where(chosen >= 0, 2 * chosen, NO_EDGE)
     solved = problem.pushes & (jnp.min(violation, axis=0) < TOLERANCE)
-    return LeastViolation(EdgeSet(edges, edges, jnp.where(chosen >= 0, jnp.maximum(force, 0), 0.0)), twist, solved)
+    return EdgeSet(edges, edges, jnp.where(chosen >= 0, jnp.maximum(force, 0), 0.0)), twist, solved

@@ -236,7 +236,7 @@ def solve_problem(
         infinite = jnp.full_like(one.twist.x, jnp.inf)
         force = Vec2(one.force.x[None], one.force.y[None])
         return ContactSolution(one.twist, one.wrench, force, one.mode[None], one.status, infinite, one.unique, guess)
-    answer = solve((form, contacts, active), guess, solver, margin=margin)
+    answer = solve(((form, contacts, active), guess), (solver, margin))
     twist, wrench, force = answer.solution
     best = None if guess is None else answer.best
     return ContactSolution(

@@ -43,7 +43,8 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
     Reference: Zhou et al. 2017, section IV.A.
     """
-    usable, contact = _replace_invalid(contact)
+    usable = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
+    contact = contact.where(usable)
     # The motion does not depend on the scale of H, but squares of H overflow or underflow in float32. So h is divided
     # by its own size, which is a constant to every derivative too.
     curve = LimitCurve.of(form, contact)
@@ -64,8 +65,8 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
     # A sliding contact needs no root. Its search gets friction zero and ends at once, so that in a batch it does not
     # delay the contacts that stick.
-    sticking = solver(curve, v, jnp.where(slides, 0.0, mu))
-    s = jnp.where(slides_left, mu, jnp.where(slides_right, -mu, sticking.ratio))
+    ratio, residual = solver(curve, v, jnp.where(slides, 0.0, mu))
+    s = jnp.where(slides_left, mu, jnp.where(slides_right, -mu, ratio))
     motion = curve.motion(s)
     squared = motion.dot(motion)
     # A sliding motion is scaled by v_n / motion_n. This needs no guard against a small motion_n. Sliding left means
@@ -83,7 +84,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     normal = contact.normal
     linear = normal.scale(point_motion.x) + normal.perp().scale(point_motion.y) - contact.point.perp().scale(omega)
     h = curve.value(s)
-    solved = (h > 0) & (slides | (sticking.residual <= relative_tolerance(s.dtype))) & jnp.isfinite(omega)
+    solved = (h > 0) & (slides | (residual <= relative_tolerance(s.dtype))) & jnp.isfinite(omega)
     moves = compute_once(pushes & solved, v.x)
     force_scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
 
@@ -102,12 +103,6 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
         jnp.where(valid, status, Status.INVALID).astype(jnp.int8),
         ~(valid & ~pushes & _can_drag(curve, mu, contact.approach())),
     )
-
-
-def _replace_invalid(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
-    """Return whether every number of a contact is usable, and the contact, replaced by one out of reach if not."""
-    usable = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
-    return usable, contact.where(usable)
 
 
 def _can_drag(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:

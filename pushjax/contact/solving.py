@@ -12,12 +12,11 @@ Derivatives are those of the solution (`derivative`), whatever found it.
 """
 
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.autodiff import search_result
 from pushjax._internal.tiles import in_search_tiles, in_tiles
@@ -27,7 +26,7 @@ from pushjax._math.sums import summed
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.derivative import differentiable_solution
 from pushjax.contact.exhaustive import Continuing
-from pushjax.contact.finish import Solution, check, in_units, refine
+from pushjax.contact.finish import Answer, Solution, check, in_units, refine
 from pushjax.contact.force_distribution import distribute_force, of_chosen
 from pushjax.contact.frictionless import Frictionless, least_violation
 from pushjax.contact.jam_certificate import Squeeze, search_squeeze, squeeze_power
@@ -51,34 +50,15 @@ from pushjax.friction.polynomial import Polynomial
 CLEARANCE = 4
 
 
-class Answer(NamedTuple):
-    """The answer to a contact problem."""
-
-    solution: Solution
-    mode: Int[Array, "contacts *batch"]  # `ContactMode`
-    status: Int[Array, "*batch"]  # `Status`
-    margin: Float[Array, "*batch"]  # minus the hand's squeeze power, m, as in `Motion`
-    unique: Bool[Array, "*batch"]  # False where the search found another twist that satisfies every condition
-    best: EdgeSet  # the cone edges that carry the force; the guess where there is no motion
-    loaded: Bool[Array, "edges *batch"]  # which edges carry force
-    indeterminate: Bool[Array, "*batch"]  # whether more edges share the force than the wrench determines
-    dual: Float[Array, "3 *batch"]  # y of `force_distribution`, where they do
-    squeeze_edges: Int[Array, "4 *batch"]  # edges of the equilibrium of the largest squeeze power
-
-
 # H, the contacts, with one axis, and whether each takes part.
 Problem = tuple[Form, Contact, Bool[Array, "contacts"]]
 
 
-def solve(problem: Problem, guess: EdgeSet | None, solver: ContactSolver, *, margin: bool) -> Answer:
-    """Solve a problem of several contacts, of one example."""
+@eqx.filter_custom_jvp
+def solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSolver, bool]) -> Answer:
+    """Solve a problem of several contacts, of one example, given a guess; the settings are a solver and `margin`."""
     # `Continuing` tries one contact alone and then the guess. Without `margin`, the margin is infinite where there is a
     # motion, which saves time.
-    return _solve((problem, guess), (solver, margin))
-
-
-@eqx.filter_custom_jvp
-def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSolver, bool]) -> Answer:
     (problem, guess), (solver, _) = arguments, settings
     form, contacts, active = problem
     attempt = _without_friction if isinstance(solver, Frictionless) else partial(_attempt, *settings)
@@ -108,10 +88,10 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
     return tree_where(suffices, alone, together)
 
 
-@_solve.def_jvp
+@solve.def_jvp
 def _solve_jvp(primals, tangents):
     (arguments, settings), change = primals, tangents[0][0]
-    answer = search_result(_solve(arguments, settings))
+    answer = search_result(solve(arguments, settings))
     near, known = partial(_near, *settings), jax.lax.stop_gradient(answer)
     _, (solution, margin) = eqx.filter_jvp(
         lambda problem: with_batch_last(near, _arrays(problem), known), (arguments[0],), (change,)
@@ -125,8 +105,7 @@ def _near(solver: ContactSolver, margin: bool, given: ContactArrays, answer: Ans
     if isinstance(solver, Frictionless):
         given = given._replace(friction=jnp.zeros_like(given.friction))
     scaled = nondimensionalize(given)
-    solved, twist = answer.status == Status.MOVING, answer.solution.twist
-    near = differentiable_solution(scaled, answer.best, solved, answer.loaded, answer.indeterminate, answer.dual, twist)
+    near = differentiable_solution(scaled, answer)
     power = jnp.zeros_like(scaled.unit)
     if margin and scaled.count > 1:
         power = jnp.where(jnp.isfinite(answer.margin), squeeze_power(scaled, answer.squeeze_edges) * scaled.unit, power)

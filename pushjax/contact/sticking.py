@@ -10,7 +10,6 @@ not depend on the coefficient of friction: ds/dmu = 0.
 """
 
 from abc import abstractmethod
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,13 +20,6 @@ from pushjax._math.vec import Scalar, Vec2
 from pushjax.contact.contact_plane import LimitCurve
 
 MAX_ITERATIONS = 12  # iterations with a bracket at most; see `ScalarRoot`
-
-
-class Sticking(NamedTuple):
-    """The result of a search for a sticking contact."""
-
-    ratio: Scalar  # f_t / f_n
-    residual: Scalar  # sine of the angle that is left between motion and push, less roundoff
 
 
 class StickingSolver(eqx.Module):
@@ -46,8 +38,11 @@ class StickingSolver(eqx.Module):
             The ratio. It is meaningful only where v_n > 0 and the contact sticks, and always finite.
         """
 
-    def __call__(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Sticking:
-        """Find the ratio, with its derivatives and its residual; the arguments are as in `iterate`."""
+    def __call__(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> tuple[Scalar, Scalar]:
+        """Find the ratio, with its derivatives, and its residual; the arguments are as in `iterate`.
+
+        The residual is the sine of the angle that is left between motion and push, less roundoff.
+        """
         ratio = _solve(self, curve, v, friction)
         motion = curve.motion(ratio)
         size = jnp.sqrt(motion.dot(motion) * v.dot(v))
@@ -56,7 +51,7 @@ class StickingSolver(eqx.Module):
         absolute_terms = LimitCurve(tuple(jnp.abs(c) for c in curve.c)).motion(jnp.abs(ratio))
         roundoff = 4 * jnp.finfo(size.dtype).eps * (absolute_terms.x * jnp.abs(v.y) + absolute_terms.y * jnp.abs(v.x))
         residual = jnp.maximum(jnp.abs(motion.cross(v)) - roundoff, 0) / jnp.where(size > 0, size, 1.0)
-        return Sticking(ratio, jax.lax.stop_gradient(residual))
+        return ratio, jax.lax.stop_gradient(residual)
 
 
 @eqx.filter_custom_jvp

@@ -113,9 +113,8 @@ class ProblemBatch:
 
     def approach(self) -> np.ndarray:
         """Return the motion along (n, t) that keeps contact points with their pushers, less the gap, (N, m, 2), m."""
-        tangent = np.stack([-self.normal[..., 1], self.normal[..., 0]], axis=2)
-        along = np.einsum("nmi,nmi->nm", self.displacement, self.normal) - self.gap
-        return np.stack([along, np.einsum("nmi,nmi->nm", self.displacement, tangent)], axis=2)
+        along = np.einsum("nmij,nmj->nmi", self.rows()[..., :2], self.displacement)
+        return along - np.stack([self.gap, np.zeros_like(self.gap)], axis=2)
 
     def hessian_table(self) -> np.ndarray:
         """Return the coefficients (N, 3, 3, q) of the Hessian of H, which is linear in the q `products`."""
