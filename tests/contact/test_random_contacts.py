@@ -78,9 +78,9 @@ def test_recorded_problems(oracle, kind, count):
 # the programs of one degree see nearly all that those of the other see
 DEGREES = pytest.mark.parametrize("degree", [pytest.param(2, marks=SLOW), 4])
 NUMBERS = [
-    *((count, 4) for count in (1, 2, 3, 4)),
-    *(pytest.param(count, 2, marks=SLOW) for count in (1, 2, 3, 4)),
-    *(pytest.param(count, degree, marks=SLOW) for count in (5, 6, 7, 8) for degree in (2, 4)),
+    *((count, 4) for count in (1, 2, 3)),
+    *(pytest.param(count, 2, marks=SLOW) for count in (1, 2, 3)),
+    *(pytest.param(count, degree, marks=SLOW) for count in (4, 5, 6, 7, 8) for degree in (2, 4)),
 ]
 
 
