@@ -87,18 +87,13 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     solved = (h > 0) & (slides | (residual <= relative_tolerance(s.dtype))) & jnp.isfinite(omega)
     moves = compute_once(pushes & solved, v.x)
     force_scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
-
-    def where_moving(value):
-        return type(value)(*(jnp.where(moves, entry, 0.0) for entry in value))
-
+    found = Vec3(linear.x, linear.y, omega), direction.scale(force_scale), Vec2(force_scale, force_scale * s)
     mode = jnp.where(
         slides_left, ContactMode.SLIDING_LEFT, jnp.where(slides_right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING)
     )
     status = jnp.where(moves, Status.MOVING, jnp.where(pushes, Status.NOT_CONVERGED, Status.FREE))
     return SingleSolution(
-        where_moving(Vec3(linear.x, linear.y, omega)),
-        where_moving(direction.scale(force_scale)),
-        where_moving(Vec2(force_scale, force_scale * s)),
+        *jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), found),
         jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8),
         jnp.where(valid, status, Status.INVALID).astype(jnp.int8),
         ~(valid & ~pushes & _can_drag(curve, mu, contact.approach())),
