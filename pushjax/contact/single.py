@@ -88,12 +88,15 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     moves = compute_once(pushes & solved, v.x)
     force_scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
     found = Vec3(linear.x, linear.y, omega), direction.scale(force_scale), Vec2(force_scale, force_scale * s)
+    twist, wrench, force = jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), found)
     mode = jnp.where(
         slides_left, ContactMode.SLIDING_LEFT, jnp.where(slides_right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING)
     )
     status = jnp.where(moves, Status.MOVING, jnp.where(pushes, Status.NOT_CONVERGED, Status.FREE))
     return SingleSolution(
-        *jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), found),
+        twist,
+        wrench,
+        force,
         jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8),
         jnp.where(valid, status, Status.INVALID).astype(jnp.int8),
         ~(valid & ~pushes & _can_drag(curve, mu, contact.approach())),
