@@ -326,12 +326,13 @@ class PushPlanner:
         # `target` is the pose that each choice is for, (choices, 3) or the same for all, and so are the poses of the
         # slider before each of the `pushes`; beside these are its entries, (choices,). Only the `MAX_COLLISION_CHECKS`
         # choices of least cost are considered.
-        space, order = self.space, np.argsort(cost, kind="stable")[:MAX_COLLISION_CHECKS]
+        order = np.argsort(cost, kind="stable")[:MAX_COLLISION_CHECKS]
         order = order[np.isfinite(cost[order])]
         for some in np.split(order, range(COLLISION_BATCH, len(order), COLLISION_BATCH)):
             free = np.ones(len(some), bool)
-            for poses, entries in pushes if space is not None else ():
-                free &= space.free(self.mean_library, np.broadcast_to(poses, (len(cost), 3))[some], entries[some])
+            for poses, entries in pushes:
+                before = np.broadcast_to(poses, (len(cost), 3))[some]
+                free &= self.space is None or self.space.free(self.mean_library, before, entries[some])
             if free.any():
                 best = some[np.argmax(free)]
                 aim = np.broadcast_to(target, (len(cost), 3))[best].astype(float)
