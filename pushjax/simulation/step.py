@@ -80,6 +80,7 @@ class Stage(NamedTuple):
     at_start: tuple[Touches, ...]  # for each finger, its contacts at the start of the step
     holds: Bool[Array, ""]  # whether all of several fingers, and no fixture, are near enough to hold a jammed slider
     is_long: Bool[Array, ""]  # whether a stage turned the slider, or let a finger slip, too far for one step
+    slides_off: Bool[Array, ""]  # whether a force acts at a contact that has slid past the end of its edge
     urgency: Urgency | None  # by which contacts are selected; None if all are solved together
     urgency_after: Urgency | None
 
@@ -102,6 +103,7 @@ class Stage(NamedTuple):
             at_start=nowhere,
             holds=no,
             is_long=no,
+            slides_off=no,
             urgency=urgency,
             urgency_after=urgency,
         )
@@ -111,9 +113,9 @@ class BodyContacts(NamedTuple):
     """The contacts of one finger or fixture in a stage."""
 
     contacts: Contact  # as they are now, with the gaps of the start of the step
-    active: Bool[Array, "contacts"]
     at_start: Touches  # as they were at the start of the step
     is_near: Bool[Array, ""]  # whether one is near enough to hold a jammed slider
+    is_past: Bool[Array, "contacts"]  # whether it has slid past the end of its edge
 
 
 class PushingPart(NamedTuple):
@@ -155,6 +157,7 @@ class PushingPart(NamedTuple):
         at_start = tree_where(in_predictor, touches, at_start)
         # what touches nothing any more keeps its contact from the start of the step
         touches = pair.matched(touches, at_start)
+        is_past = at_start.exists & ~touches.exists
         touches = tree_where(touches.exists, touches, at_start)
         # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
         gap = _gap(at_start.distance, (DEPTH_FLOOR if is_fixture else TOUCHING[x.dtype.itemsize]) * self.length)
@@ -163,7 +166,8 @@ class PushingPart(NamedTuple):
             lambda entry: jnp.broadcast_to(entry, gap.shape), (displacement, body.friction)
         )
         contacts = compute_once(Contact(touches.point, touches.normal, displacement, friction, gap), x)
-        return BodyContacts(contacts, at_start.exists, at_start, jnp.any(at_start.exists & (gap <= self.reach)))
+        is_near = jnp.any(at_start.exists & (gap <= self.reach))
+        return BodyContacts(contacts, at_start, is_near, is_past)
 
 
 def _map_bodies(function, motions: tuple, fixtures: tuple, *others: tuple) -> tuple:
@@ -204,8 +208,8 @@ def compute_step(
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
         frame = start.moved(before.middle, before.solution.twist.scale(fraction), before.angle)
         found = _map_bodies(partial(part.contacts_of, frame, fraction), motions, fixtures, features, before.at_start)
-        contacts, active, at_start, near = zip(*found, strict=True)
-        contacts, active = joined(*contacts), jnp.concatenate(active)
+        contacts, at_start, near, past = zip(*found, strict=True)
+        contacts, active = joined(*contacts), joined(*at_start).exists
         used_urgency, working, guess = before.urgency, given_set, before.solution.best
         if fixtures and used_urgency is not None:
             # in the first try, contacts are selected by how far the step would press them into a slider at rest
@@ -228,6 +232,7 @@ def compute_step(
             at_start=at_start,
             holds=_holds(near, len(motions)),
             is_long=is_long,
+            slides_off=jnp.any(jnp.concatenate(past) & (solution.force.x > 0)),
             urgency=used_urgency,
             urgency_after=None if urgency is None else violations(contacts, active, solution),
         ), None

@@ -2,20 +2,20 @@
 
 A step is too long if its result leaves a finger inside the slider. This happens if the slider turned so far that
 another of its corners came to touch, or if it slid past the end of what a finger rests on; no contact that is detected
-at the start shows either. Such a step is undone and tried again with half the size, down to a part of `SMALLEST_PART`
-of the step. A part that succeeds is followed by one of twice the size. Right after a failure it is first followed by
-one of the same size. Before a part is accepted or halved, a contact that the result violates and that was not in the
-contact problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
-NOT_CONVERGED, and the slider stays where the step began.
-
-A step is also too long if the slider moves far and much faster than the hand (`slider_speed`).
+at the start shows either. A step is also too long if a contact that carries a force slides past the end of its edge,
+as if the edge were longer, or if the slider moves far and much faster than the hand (`slider_speed`). Such a step is
+undone and tried again with half the size, down to a part of `SMALLEST_PART` of the step. A part that succeeds is
+followed by one of twice the size. Right after a failure it is first followed by one of the same size. Before a part is
+accepted or halved, a contact that the result violates and that was not in the contact problem joins the problem
+(`working_set`), which is then solved again. If the smallest part fails, the step is NOT_CONVERGED, and the slider stays
+where the step began.
 
 Each push of a batch advances at its own pace: a round of the one loop is the next trial of every push, in whichever
 step that push is. So a push that divides its steps delays the others only at the end, and no trial is made for a push
 that has ended. Trials that are undone do not contribute to derivatives, which are those of the accepted parts.
 
 A jam is proved to first order only: within a long step the slider may turn out of it. So a whole step that jams is
-divided, too, and its first part has the size `JAM_PART`. If a part of that size jams, the hand stops where that part
+divided, too, and its first part has the size `EVENT_PART`. If a part of that size jams, the hand stops where that part
 began. If all parts move, so does the step.
 
 If a body that holds the slider has no friction, the slider turns ever faster, without bound, while the last gap closes:
@@ -51,7 +51,7 @@ from pushjax.simulation.step import Stage, StepRecord, compute_step, hand_stops
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
 SMALLEST_PART = 1 / 256  # of a step
-JAM_PART = 1 / 16  # of a step that jams as a whole: size of the part that has to jam, too
+EVENT_PART = 1 / 16  # of a step: the part of a jam that has to jam, too, and that may end past the end of an edge
 # A path of n steps has at most TRIALS_PER_STEP * n + EXTRA_TRIALS trials. The steps that are left after that are
 # NOT_CONVERGED, and the slider stays where the last accepted part left it. A grasp of a slider with many corners takes
 # 1.1 trials per step.
@@ -253,7 +253,7 @@ class Decision(NamedTuple):
 def _decide(
     state: PushState,  # before the trial
     record: StepRecord,  # of the trial
-    urgency_after: Urgency | None,
+    last_stage: Stage,
     depth: Scalar,  # of the deepest finger after the trial, m
     tolerance: Scalar,  # how much deeper a finger may be after a whole step, m
     speed: SpeedJudgment,
@@ -265,13 +265,14 @@ def _decide(
     # whole step
     allowed_share = jnp.where(state.part < 2 * SMALLEST_PART, 1.0, state.part)
     clear = speed.allowed & (depth <= jnp.maximum(state.overlap, allowed_share * tolerance))
+    clear &= ~last_stage.slides_off | (state.part < 2 * EVENT_PART) | state.failed
     # In a step that is divided for another reason, only the smallest part can confirm a jam, because a slider that
     # squirts out turns far in one step.
-    smallest = jnp.where(state.whole_step_jams, JAM_PART, SMALLEST_PART)
+    smallest = jnp.where(state.whole_step_jams, EVENT_PART, SMALLEST_PART)
     # if the slider was left behind in the previous step, the step is not tried in parts again
     may_not_divide = (state.part < 2 * smallest) | state.failed
     stops = may_not_divide & hand_stops(record.status) & ~fails
-    joins = jnp.zeros((), bool)
+    joins, urgency_after = jnp.zeros((), bool), last_stage.urgency_after
     if urgency_after is not None:
         worst = jnp.max(jnp.where(urgency_after < LOADED, urgency_after, -jnp.inf))
         joins = is_solved & ~fails & (state.swaps < MAX_SWAPS) & (worst > MISSED_FRACTION * state.part * tolerance)
@@ -305,7 +306,7 @@ def _next_state(
     ongoing = state.step < steps
     pose = tree_where(compute_once(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
-    decision = _decide(state, record, last_stage.urgency_after, depth, tolerance, speed)
+    decision = _decide(state, record, last_stage, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
     moves = compute_once(record.status == Status.MOVING, pose.x)
@@ -324,7 +325,7 @@ def _next_state(
     restarts = (ends & ~stops) | decision.abandons
     jams = (state.part == 1) & hand_stops(record.status)
     again = decision.joins | decision.braces
-    smaller = jnp.where(again, state.part, jnp.where(jams, JAM_PART, state.part / 2))
+    smaller = jnp.where(again, state.part, jnp.where(jams, EVENT_PART, state.part / 2))
     larger = jnp.where(state.halved | ~speed.allowed_in_double, state.part, 2 * state.part)
     next_state = PushState(
         pose=tree_where(ends, outcome.pose, tree_where(continues, pose, state.pose)),
