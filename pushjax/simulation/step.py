@@ -201,7 +201,6 @@ def compute_step(
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
     counts = [num_contacts(body.finger, outline) for body in motions + fixtures]
     size, has_end = num_solved_together(counts), _has_end(motions + fixtures, counts)
-    given_set = WorkingSet.most_urgent(urgency, size)
     features = _map_bodies(lambda _, body: part.features_of(body), motions, fixtures)
 
     def stage(before: Stage, fraction: Scalar) -> tuple[Stage, None]:
@@ -210,12 +209,12 @@ def compute_step(
         found = _map_bodies(partial(part.contacts_of, frame, fraction), motions, fixtures, features, before.at_start)
         contacts, at_start, near, past = zip(*found, strict=True)
         contacts, active = joined(*contacts), joined(*at_start).exists
-        used_urgency, working, guess = before.urgency, given_set, before.solution.best
+        used_urgency, guess = before.urgency, before.solution.best
         if fixtures and used_urgency is not None:
             # in the first try, contacts are selected by how far the step would press them into a slider at rest
             pressed = jax.lax.stop_gradient(jnp.where(active, contacts.approach().x, -LOADED))
             used_urgency = jnp.where((fraction == 0) & is_first_try, pressed, used_urgency)
-            working = WorkingSet.most_urgent(used_urgency, size)
+        working = WorkingSet.most_urgent(used_urgency, size)
         works = before.solution.status <= Status.FREE  # else the step has failed, and the corrector solves nothing
         tried = None if guess is None else working.local(guess)
         solution = solve_problem(form, *working.select(contacts, active & ongoing & works), solver, tried)
@@ -237,8 +236,8 @@ def compute_step(
             urgency_after=None if urgency is None else violations(contacts, active, solution),
         ), None
 
-    fractions = jnp.array([0.0, 0.5], pose.x.dtype)
-    last, _ = jax.lax.scan(stage, Stage.before(start, counts, urgency, guess), fractions)
+    before = Stage.before(start, counts, urgency, guess)
+    last, _ = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
     moved_pose = start.moved(last.middle, last.solution.twist, last.angle).pose
     status = _status(last, motions, fixtures, overlap_before, form.length)
     return _keep_pose_unless_moving(last, moved_pose, pose, status), last
