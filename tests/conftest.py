@@ -35,6 +35,7 @@ gc.set_threshold(100_000, 50, 100)
 
 # Each free worker takes the next file. The long files come first, so that none of them ends long after the others.
 LONG = (
+    "million_steps",
     *("docs", "overlaps", "invariance", "grasps", "random_contacts", "commands", "table1", "more_tasks", "rollout"),
     *("identify_logs", "identify", "derivatives", "bench", "push_t_episodes", "push_t", "fixtures", "gym", "search"),
     *("friction_model", "single_contact", "contact_derivatives", "several_contacts", "impact", "pusht_mpc"),
