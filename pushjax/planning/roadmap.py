@@ -231,22 +231,21 @@ class Roadmap:
         reach = missing * np.array([1.0, 1.5, 2.0, 3.0, 5.0, 8.0][: 6 if obstacles.any else 4]) + 1e-3 * self.clearance
         ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
         good = workspace.allows_finger(to_world(pose, ends))
-        for solid, required in solids:
-            good &= _recedes(solid, required, start, ends)
+        for (solid, required), distance in zip(solids, distances, strict=True):
+            good &= _recedes(solid, distance, required, start, ends)
         if not good.any():
             return start[None], TransitStatus.NO_RETREAT
         best = np.argmin(np.where(good, np.linalg.norm(ends - start, axis=1), np.inf))
         return np.stack([start, ends[best]]), TransitStatus.FOUND
 
 
-def _recedes(solid: Obstacles, required: float, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return whether segments end at the required distance or more, and are nowhere nearer than at their start."""
-    at_start = float(solid.point_clearance(start))
+def _recedes(solid: Obstacles, distance: float, required: float, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return whether segments from a start at a distance end at the required one or more, and are nowhere nearer."""
     # A little after the start the distance must have grown, to exclude segments that slide along an edge.
     early = solid.point_clearance(start + 0.2 * (ends - start))
-    grows = at_start >= required or early > at_start + 0.02 * (required - at_start)
+    grows = distance >= required or early > distance + 0.02 * (required - distance)
     least = solid.segment_clearance(start, ends)
-    return grows & (least >= min(at_start, required) * (1 - 1e-9)) & (solid.point_clearance(ends) >= required)
+    return grows & (least >= min(distance, required) * (1 - 1e-9)) & (solid.point_clearance(ends) >= required)
 
 
 def run_ups(
