@@ -33,10 +33,11 @@ WORLD = shapely.union_all(
     + [shapely.Point(0.33, 0.45).buffer(0.03, quad_segs=64)]
 )
 STEPS = 32  # of the simulation of a control step
+VERTICES = np.asarray(scene_of().slider.shape.vertices, float)
 
 
 def placed(pose):
-    return shapely.Polygon(to_world(np.asarray(pose, float), np.asarray(scene_of().slider.shape.vertices, float)))
+    return shapely.Polygon(to_world(np.asarray(pose, float), VERTICES))
 
 
 def starts(count, low=0.06, high=0.20):
