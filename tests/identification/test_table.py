@@ -159,7 +159,7 @@ def test_float32_table():
 
 
 @pytest.mark.slow
-def test_found_again(square, expected, hand):  # noqa: F811
+def test_found_again(square, expected, hand, tmp_path):  # noqa: F811
     """An uneven table, the offset of the frame, drift and sides are recovered from pushes simulated with them."""
     rng = np.random.default_rng(5)
     starts, paths = planned(rng, 120)
@@ -203,6 +203,11 @@ def test_found_again(square, expected, hand):  # noqa: F811
     assert set(found.interval()) == {"friction", *uneven}
     with pytest.raises(ValueError, match=f"corrected cannot represent {', '.join(uneven)};"):
         found.corrected(slider, hand, jnp.asarray(paths[0]))
+    found.save(tmp_path / "found.json")
+    again = pj.Identified.load(tmp_path / "found.json")
+    assert jax.tree.structure(again) == jax.tree.structure(found)
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow
@@ -232,16 +237,3 @@ def test_overlap_found_again(square, expected, hand):  # noqa: F811
     wide = pj.Pushes(starts, jnp.zeros((*paths.shape[:2], two.dof)), starts)
     with pytest.raises(ValueError, match="overlap is for a single round finger; the hand has 2 fingers"):
         pj.identify(wide, slider, two, pj.Unknowns(overlap=0.5))
-
-
-@pytest.mark.slow
-def test_saved_with_a_table(square, expected, hand, tmp_path):  # noqa: F811
-    starts, paths = planned(np.random.default_rng(7), 5)
-    pushes = pj.Pushes(starts, paths, starts)
-    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=None, anisotropy=0.1, sides=2)
-    found = pj.identify(pushes, pj.Slider(square, expected), hand, unknowns)
-    found.save(tmp_path / "found.json")
-    again = pj.Identified.load(tmp_path / "found.json")
-    assert jax.tree.structure(again) == jax.tree.structure(found)
-    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True):
-        np.testing.assert_array_equal(one, other)
