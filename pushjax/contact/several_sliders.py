@@ -32,7 +32,8 @@ from pushjax.contact.linear_patch import LinearPatch, mean_ellipsoid
 from pushjax.contact.sliders_problem import LinearLaws, SlidersLCP, SlidersProblem
 from pushjax.contact.status import ContactMode, Status
 
-MAX_ROUNDS = 40  # most problems take three to six
+# Most problems take three to six rounds, and one or two from the motion of a similar problem.
+MAX_ROUNDS, MAX_ROUNDS_FROM_START = 40, 5
 # Keyed by the bytes of a float: the least weight of a slider, and the part of the ellipsoid's law in a Newton round, in
 # units of the largest weight.
 LEAST_WEIGHT, PROXIMAL = {4: 1e-3, 8: 1e-4}, {4: 1e-3, 8: 1e-5}
@@ -59,6 +60,20 @@ class SlidersMotion(NamedTuple):
     rounds: Int[Array, " batch"]
 
 
+class Start(NamedTuple):
+    """Where the search for a motion may start: at that of a similar problem."""
+
+    exists: Bool[Array, "*batch"]
+    dissipation: Float[Array, "sliders *batch"]
+    wrench: Float[Array, "3 sliders *batch"]
+
+    @staticmethod
+    def none(problem: SlidersProblem) -> "Start":
+        """Nothing to start from."""
+        zero = jnp.zeros_like(problem.rows[0, :, :, 0])
+        return Start(jnp.zeros(zero.shape[2:], bool), zero[0], zero)
+
+
 class _Round(NamedTuple):
     """What a round starts from."""
 
@@ -69,11 +84,8 @@ class _Round(NamedTuple):
 
     def laws(self, surface: Any, mean: Float[Array, "3 3 sliders batch"]) -> LinearLaws:
         """The laws of the sliders in this round."""
-        item, newton, patch = (
-            self.weight.dtype.itemsize,
-            self.is_newton[None, None],
-            LinearPatch.at(surface, self.wrench),
-        )
+        item, newton = self.weight.dtype.itemsize, self.is_newton[None, None]
+        patch = LinearPatch.at(surface, self.wrench)
         largest = jnp.max(self.weight, axis=0)[None]
         weight = jnp.maximum(self.weight, LEAST_WEIGHT[item] * largest)[None, None]
         ellipsoid = jnp.where(self.is_first[None, None, None], mean, patch.ellipsoid())
@@ -94,21 +106,30 @@ class _State(NamedTuple):
     number: Int[Array, ""]
 
 
-def solve_sliders(problem: SlidersProblem) -> SlidersMotion:
-    """Find the motion of several sliders; it is not differentiated. All numbers are zero where they do not move."""
+def solve_sliders(
+    problem: SlidersProblem, start: Start | None = None, anew: Bool[Array, ""] | bool = True
+) -> SlidersMotion:
+    """Find the motion of several sliders; it is not differentiated. All numbers are zero where they do not move.
+
+    If not `anew`, few rounds are tried, the first of them from `start`.
+    """
     problem, valid = problem.usable()
+    start = Start.none(problem) if start is None else start
     pushes = jnp.any(problem.active & (problem.goal[0] > 0), axis=0)
     force, none = jnp.zeros_like(problem.goal), jnp.zeros_like(pushes)
     zero = problem.wrenches(force)
     still = _motion(problem, force, zero[0], jnp.zeros((3 * problem.count + len(zero[0]), none.size), bool), 0)
     unsolved = jnp.full_like(still.status, Status.NOT_CONVERGED)
     first = _Round(none, ~none, jnp.ones_like(zero[0]), jnp.ones_like(zero))
+    guess = _Round(~none, none, start.dissipation + zero[0], start.wrench + zero)
+    guess = _where(start.exists & ~jnp.asarray(anew) & ~none, guess, first)
     infinite = jnp.full_like(still.violation, jnp.inf)
     best, mean = still._replace(violation=infinite, status=unsolved), mean_ellipsoid(problem.surface, zero)
+    most = jnp.where(anew, MAX_ROUNDS, MAX_ROUNDS_FROM_START)
     last = jax.lax.while_loop(
-        lambda state: jnp.any(state.ongoing) & (state.number < MAX_ROUNDS),
+        lambda state: jnp.any(state.ongoing) & (state.number < most),
         lambda state: _next_round(problem, mean, state),
-        _State(first, first, infinite, best, pushes, jnp.zeros((), jnp.int32)),
+        _State(guess, first, infinite, best, pushes, jnp.zeros((), jnp.int32)),
     ).best
     refined = jax.lax.fori_loop(0, REFINEMENTS, lambda _, motion: _refined(problem, motion), last)
     found = _where(refined.violation < last.violation, refined, last)

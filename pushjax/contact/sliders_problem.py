@@ -46,7 +46,9 @@ class SlidersProblem(NamedTuple):
         return jnp.sum(self.rows * twist[None, :, :, None], axis=(1, 2)) - self.goal
 
     def usable(self) -> tuple["SlidersProblem", Bool[Array, " batch"]]:
-        """The problem without numbers that cannot be computed with, and whether there were none."""
+        """The problem without numbers that cannot be computed with, all of one batch, and whether there were none."""
+        size = jnp.broadcast_shapes(*(leaf.shape[-1:] for leaf in jax.tree.leaves(self)))
+        self = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], *size)), self)
         finite = jnp.all(jnp.isfinite(self.surface.table), axis=(0, 1, 2, 3))
         own = jnp.isfinite(jnp.sum(self.rows, axis=(0, 1, 2)) + jnp.sum(self.goal, axis=0) + self.friction)
         valid = finite & jnp.all((own & (self.friction >= 0)) | ~self.active, axis=0)

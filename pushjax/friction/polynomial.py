@@ -23,6 +23,16 @@ class Polynomial(NamedTuple):
         """H, given the rows of the table for the six entries of a symmetric matrix (`Form.table`)."""
         return Polynomial(entries[FULL])
 
+    def squared(self) -> "Polynomial":
+        """The square of a quadratic H, which is a quartic with the same limit surface."""
+        a = self.table[:, :, 0]
+        terms = [
+            a * a[i, j][None, None] + a[:, i][:, None] * a[j][None] + a[:, j][:, None] * a[i][None] for i, j in ENTRIES
+        ]
+        return Polynomial(
+            jnp.stack([term if i == j else 2 * term for term, (i, j) in zip(terms, ENTRIES, strict=True)], 2)
+        )
+
     @property
     def degree(self) -> int:
         """Degree of H."""

@@ -1,0 +1,136 @@
+"""The motion of several sliders of one example, in physical units: batched by `vmap`, and differentiable.
+
+In a batch, the guess is tried first: some Newton rounds from the wrenches of the stage before. Those examples that it
+does not solve start anew (`in_tiles`).
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from pushjax._internal.autodiff import search_result
+from pushjax._internal.tiles import in_tiles
+from pushjax._internal.trailing_batch import with_batch_last
+from pushjax._math.vec import Scalar, Vec2
+from pushjax.contact.contact_plane import Contact
+from pushjax.contact.several_sliders import SlidersMotion, Start, differentiable_motion, solve_sliders
+from pushjax.contact.sliders_problem import SlidersProblem
+from pushjax.contact.status import Status
+from pushjax.friction.limit_surface import Form
+from pushjax.friction.polynomial import Polynomial
+
+
+class Touching(NamedTuple):
+    """Contacts of sliders with each other and with pushers, with one axis; those of one example."""
+
+    contact: Contact  # in the frame of the first slider; its displacement is that of the second body
+    point: Vec2  # the same points in the frame of the second slider, m; of no meaning for a pusher
+    normal: Vec2  # the same normals
+    pairs: tuple[tuple[int, int | None], ...]  # the two sliders of each contact; None for a pusher
+    active: Bool[Array, "contacts"]
+
+
+class SlidersSolution(NamedTuple):
+    """The motion of several sliders of one example."""
+
+    twist: Float[Array, "3 sliders"]  # body frames, m, m, rad; zero of a slider that rests
+    wrench: Float[Array, "3 sliders"]  # normalized, N
+    force: Float[Array, "2 contacts"]  # along normal and tangent, N
+    mode: Int[Array, "contacts"]  # `ContactMode`
+    rests: Bool[Array, "sliders"]
+    status: Int[Array, ""]  # `Status`
+    guess: Start  # where the next solution may start
+
+
+def solve_touching(forms: tuple[Form, ...], touching: Touching, guess: Start | None) -> SlidersSolution:
+    """Find the motion of several sliders."""
+    problem, displacement_unit, force_unit = _scaled(forms, touching)
+    motion = _solve(problem, Start.none(problem) if guess is None else guess)
+    ones = jnp.ones_like(displacement_unit)
+    units = jnp.stack([jnp.stack([ones, ones, 1 / form.length]) for form in forms], axis=1)
+    moves = motion.status == Status.MOVING
+    return SlidersSolution(
+        motion.twist * units * displacement_unit,
+        motion.wrench * force_unit,
+        motion.force * force_unit,
+        motion.mode,
+        ~(moves & (motion.dissipation > 0)),
+        motion.status,
+        jax.lax.stop_gradient(Start(moves, motion.dissipation, motion.wrench)),
+    )
+
+
+def _scaled(forms: tuple[Form, ...], touching: Touching) -> tuple[SlidersProblem, Scalar, Scalar]:
+    """The dimensionless problem, and the units of displacement and force, which are constants to every derivative."""
+    contact, active = touching.contact, touching.active
+    surfaces = [Polynomial.of(form.table()) for form in forms]
+    if any(surface.degree == 4 for surface in surfaces):
+        surfaces = [surface if surface.degree == 4 else surface.squared() for surface in surfaces]
+    surface = Polynomial(jnp.stack([surface.table for surface in surfaces], axis=-1))
+    force_unit = jax.lax.stop_gradient(1 / surface.root(jnp.min(surface.scale())))
+    surface = Polynomial(surface.table * force_unit**surface.degree)
+
+    size = jnp.maximum(jnp.maximum(jnp.abs(contact.displacement.x), jnp.abs(contact.displacement.y)), -contact.gap)
+    unit = jax.lax.stop_gradient(jnp.max(jnp.where(active & jnp.isfinite(size), size, 0.0)))
+    unit = jnp.where(unit > 0, unit, 1.0)
+    tangent = contact.normal.perp()
+    goal = jnp.stack([contact.displacement.dot(contact.normal) - contact.gap, contact.displacement.dot(tangent)]) / unit
+    sides = [(_rows(contact.point, contact.normal), 1.0), (_rows(touching.point, touching.normal), -1.0)]
+    rows = []
+    for slider, form in enumerate(forms):
+        scale = jnp.stack([jnp.ones_like(form.length), jnp.ones_like(form.length), 1 / form.length])
+        own = jnp.zeros((2, 3, len(touching.pairs)), goal.dtype)
+        for side, (of_side, sign) in enumerate(sides):
+            takes_part = jnp.asarray([pair[side] == slider for pair in touching.pairs])
+            own += jnp.where(takes_part[None, None], sign * of_side * scale[None, :, None], 0.0)
+        rows.append(own)
+    return SlidersProblem(surface, jnp.stack(rows, axis=2), goal, contact.friction, active), unit, force_unit
+
+
+def _rows(point: Vec2, normal: Vec2) -> Float[Array, "2 3 contacts"]:
+    """The motion (n, t) of points by a twist."""
+    tangent = normal.perp()
+    return jnp.stack([jnp.stack([axis.x, axis.y, point.cross(axis)]) for axis in (normal, tangent)])
+
+
+@eqx.filter_custom_jvp
+def _solve(problem: SlidersProblem, guess: Start) -> SlidersMotion:
+    """Solve a problem of one example."""
+    return in_tiles(_attempt, jnp.ones((), bool), guess.exists, problem, guess)
+
+
+@_solve.def_jvp
+def _solve_jvp(primals, tangents):
+    (problem, guess), change = primals, tangents[0]
+    motion = search_result(_solve(problem, guess))
+    known = jax.lax.stop_gradient(motion)
+    leaves, structure = jax.tree.flatten((problem, known))
+    near = partial(_near, structure, [leaf.ndim for leaf in leaves])
+    _, slopes = eqx.filter_jvp(lambda problem: with_batch_last(near, (problem, known)), (problem,), (change,))
+    unchanged = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, motion)
+    return motion, unchanged._replace(**slopes)
+
+
+def _near(structure: Any, ranks: list[int], given: tuple[SlidersProblem, SlidersMotion]) -> dict[str, Array]:
+    """What can be differentiated of the motion, with any number of axes for the batch."""
+    leaves = jax.tree.leaves(given)
+    batch = jnp.broadcast_shapes(*(leaf.shape[rank:] for leaf, rank in zip(leaves, ranks, strict=True)))
+    flat = [
+        jnp.broadcast_to(leaf, (*leaf.shape[:rank], *batch)).reshape(*leaf.shape[:rank], -1)
+        for leaf, rank in zip(leaves, ranks, strict=True)
+    ]
+    motion = differentiable_motion(*jax.tree.unflatten(structure, flat))
+    slopes = {name: getattr(motion, name) for name in ("twist", "wrench", "force", "dissipation")}
+    return {name: value.reshape(*value.shape[:-1], *batch) for name, value in slopes.items()}
+
+
+def _attempt(
+    again: Int[Array, ""], problem: SlidersProblem, guess: Start
+) -> tuple[SlidersMotion, Bool[Array, " batch"]]:
+    """Solve a batch of problems from the guess, or in the second attempt anew."""
+    motion = solve_sliders(problem, guess, again > 0)
+    return motion, (motion.status == Status.NOT_CONVERGED)
