@@ -360,6 +360,7 @@ def test_contact_at_end_determines_offsets(square, real, expected, hand, tmp_pat
     found = pj.identify(pushes, mean, hand, unknowns, contact_at_end=True)
     assert 0.5e-4 < float(found.gap_sigma) < 3e-4
     own = found.parameters
+    assert own.frame_offset is not None
     off = [*(own.hand_offset - hand_offset), *(own.frame_offset[:2] - frame_offset[:2])]
     assert np.linalg.norm(off) < 2.5e-4
     low, high = found.interval(0.99)["hand_offset"]
