@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._internal.autodiff import search_result
 from pushjax._internal.tiles import in_tiles
 from pushjax._internal.trailing_batch import with_batch_last
-from pushjax._math.vec import Scalar, Vec2
+from pushjax._internal.xla import tree_where
+from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.several_sliders import SlidersMotion, Start, differentiable_motion, solve_sliders
 from pushjax.contact.sliders_problem import SlidersProblem
@@ -37,30 +38,34 @@ class Touching(NamedTuple):
 class SlidersSolution(NamedTuple):
     """The motion of several sliders of one example."""
 
-    twist: Float[Array, "3 sliders"]  # body frames, m, m, rad; zero of a slider that rests
-    wrench: Float[Array, "3 sliders"]  # normalized, N
-    force: Float[Array, "2 contacts"]  # along normal and tangent, N
+    twist: Vec3  # body frames, m, m, rad, (sliders,) each; zero of a slider that rests
+    wrench: Vec3  # normalized, N
+    force: Vec2  # along (normal, tangent), (contacts,) each, N
+    slip: Vec2  # motion (n, t) at each contact beyond the displacement and the gap of its second body, m
     mode: Int[Array, "contacts"]  # `ContactMode`
     rests: Bool[Array, "sliders"]
     status: Int[Array, ""]  # `Status`
-    guess: Start  # where the next solution may start
+    best: Start  # where the next solution may start: here, or where this one started
 
 
 def solve_touching(forms: tuple[Form, ...], touching: Touching, guess: Start | None) -> SlidersSolution:
     """Find the motion of several sliders."""
     problem, displacement_unit, force_unit = _scaled(forms, touching)
-    motion = _solve(problem, Start.none(problem) if guess is None else guess)
+    guess = Start.none(problem) if guess is None else guess
+    motion = _solve(problem, guess)
     ones = jnp.ones_like(displacement_unit)
-    units = jnp.stack([jnp.stack([ones, ones, 1 / form.length]) for form in forms], axis=1)
+    units = jnp.stack([jnp.stack([ones, ones, 1 / form.length]) for form in forms], axis=1) * displacement_unit
     moves = motion.status == Status.MOVING
+    found = Start(moves, motion.dissipation, motion.wrench)
     return SlidersSolution(
-        motion.twist * units * displacement_unit,
-        motion.wrench * force_unit,
-        motion.force * force_unit,
+        Vec3.of(motion.twist * units),
+        Vec3.of(motion.wrench * force_unit),
+        Vec2.of(motion.force * force_unit),
+        Vec2.of(problem.slips(motion.twist) * displacement_unit),
         motion.mode,
         ~(moves & (motion.dissipation > 0)),
         motion.status,
-        jax.lax.stop_gradient(Start(moves, motion.dissipation, motion.wrench)),
+        jax.lax.stop_gradient(tree_where(moves, found, guess)),
     )
 
 

@@ -30,6 +30,7 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.path import checked_path
 from pushjax.simulation.slider import Slider, fixture_overlaps, overlaps
+from pushjax.simulation.sliders_step import can_push
 
 POSES_AT_ONCE = 4096  # poses whose overlaps are computed together
 # Numbers beyond these are probably in other units: length of a surface, m; distance of a hand from the origin, in
@@ -86,7 +87,7 @@ def warn_about_units(slider: Slider, pose: Array, *paths: Array) -> None:
 
 
 def checked_rollout_arguments(
-    slider: Slider, hand: Hand, path: ArrayLike, pose: ArrayLike, friction: ArrayLike, pushes: int | None = None
+    slider: Any, hand: Hand, path: ArrayLike, pose: ArrayLike, friction: ArrayLike, pushes: int | None = None
 ):
     """Return slider, hand, path, start and friction of a rollout, in one dtype and checked where values are known."""
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
@@ -102,6 +103,41 @@ def checked_rollout_arguments(
     check_opening(hand, path_array)
     check_start(slider, hand, start, path_array[..., 0, :])
     return slider, hand, path_array, start, mu
+
+
+def checked_sliders_arguments(
+    sliders: Sequence[Slider],
+    hand: Hand,
+    path: ArrayLike,
+    pose: ArrayLike,
+    friction: ArrayLike,
+    between: ArrayLike | None,
+):
+    """Return the arguments of a rollout of several sliders, as above, with their friction (fingers, between)."""
+    if not sliders:
+        raise ValueError("slider: a tuple of sliders needs at least one; got none")
+    if between is None:
+        raise ValueError("between: several sliders need the coefficient of friction with each other; got None")
+    for k, slider in enumerate(sliders):
+        check_type(f"slider[{k}]", slider, Slider)
+    dtype, count = common_dtype(tuple(sliders), hand, pose, friction, path, between), len(sliders)
+    start = checked_array("pose", pose, (count, 3), dtype)
+    mutual = as_float(between, dtype, "between")
+    if mutual.shape not in ((), (count, count)):
+        raise ValueError(f"between has shape {mutual.shape}; expected a scalar or ({count}, {count})")
+    check_finite("between", mutual)
+    check_non_negative("between", mutual)
+    mutual = jnp.broadcast_to(mutual, (count, count))
+    known = concrete(mutual)
+    if known is not None and np.any(known != known.T):
+        raise ValueError(f"between must be symmetric; got {known.tolist()}")
+    concave = [k for k, slider in enumerate(sliders) if not can_push(slider.shape)]
+    if len(concave) > 1:
+        raise ValueError(f"slider: of each two, one must be a disk or a convex polygon; sliders {concave} are not")
+    each = [checked_rollout_arguments(s, hand, path, start[k], friction) for k, s in enumerate(sliders)]
+    cast = tuple(jax.tree.map(lambda leaf: leaf.astype(dtype), one[0]) for one in each)
+    _, hand, path_array, _, mu = each[0]
+    return cast, hand, path_array, start, (mu, mutual)
 
 
 def _check_columns(path: Array, hand: Hand) -> None:

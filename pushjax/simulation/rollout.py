@@ -7,7 +7,7 @@ If no motion satisfies every contact, the hand has jammed, and it stops there fo
 changes nothing.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -31,22 +31,19 @@ from pushjax.simulation.arguments import (
     checked_arguments,
     checked_fixtures,
     checked_rollout_arguments,
+    checked_sliders_arguments,
     checked_table,
     warn_about_units,
 )
 from pushjax.simulation.detection import num_contacts
-from pushjax.simulation.domain import MAX_FRICTION, are_valid, poses_are_moderate, replace_invalid, valid_path
-from pushjax.simulation.finger_motion import (
-    finger_motions,
-    fixture_motions,
-    unstack_finger_poses,
-)
+from pushjax.simulation.domain import poses_are_moderate
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
+from pushjax.simulation.prepared_push import FrictionAt, prepared_push
+from pushjax.simulation.several_sliders import simulate_sliders
 from pushjax.simulation.slider import Slider
-from pushjax.simulation.step import hand_stops
-from pushjax.simulation.substeps import PreparedPush, simulate_in_substeps
-from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
+from pushjax.simulation.substeps import simulate_in_substeps
+from pushjax.simulation.trajectory import Step, Trajectory, trajectory_of
 from pushjax.simulation.whole_steps import simulate_in_whole_steps
 
 MIN_SIZE, SIZE_RATIO = 32, 4  # steps that programs are compiled for: 32, 128, 512, ...
@@ -110,7 +107,7 @@ def _step(slider, hand, q0, q1, pose, friction, solver, table, fixtures) -> Step
 
 
 def rollout(
-    slider: Slider,
+    slider: Slider | Sequence[Slider],
     hand: Hand,
     path: ArrayLike,
     *,
@@ -119,8 +116,9 @@ def rollout(
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
     fixtures: Sequence[Wall | Fixture] = (),
+    between: ArrayLike | None = None,
 ) -> Trajectory:
-    """Push the slider along a path of hand configurations.
+    """Push the slider, or several that push each other, along a path of hand configurations.
 
     There is no state besides the slider's pose: a push continues with `rollout(..., rest_of_path, pose=push.pose[-1])`.
     Four things are remembered within a rollout only. A hand that has jammed stays where it is. The step after a failed
@@ -131,23 +129,28 @@ def rollout(
     `vmap` for batches.
 
     Args:
-        slider: The slider.
+        slider: The slider; or a tuple of several, each pair of which has a disk or a convex polygon.
         hand: The hand.
         path: Configurations of the hand, (steps + 1, dof), world, m and rad (`line`, `resample` or any recording). The
             size of the steps sets the accuracy.
-        pose: Pose of the slider at the start, (3,), world, m and rad.
+        pose: Pose of the slider at the start, (3,), world, m and rad; of several, (sliders, 3).
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
         solver: Solver of contact problems. The default suits every hand. Where several motions satisfy all contacts,
             the default takes the one that continues, if one does. `Exhaustive()` takes the one of largest power.
         table: A table whose friction depends on direction or place; None for uniform friction.
         fixtures: Walls (`Wall`) and convex bodies (`Fixture`) that stay where they are, and that the slider may touch.
             Their contacts come after those of the fingers.
+        between: Coefficient of friction of several sliders with each other, a scalar or (sliders, sliders).
 
     Returns:
-        The push, step by step.
+        The push, step by step. Of several sliders, pose, twist and wrench have an axis for them. The contacts are those
+        of the first slider with each finger, of the second one, and so on; then those with fixtures; then those of
+        sliders 1 and 0, 2 and 0, 2 and 1, and so on. They are in the frame of the first of the two, or of the second
+        one if only that one is not convex.
 
     Raises:
-        ValueError: As in `step`. Also for a finger or a fixture that starts inside the slider by more than a fifth of
+        ValueError: As in `step`; for several sliders also without `between`, or with a solver or a table, which are
+            for one. Also for a finger or a fixture that starts inside the slider by more than a fifth of
             the surface's length, where this is not traced (a smaller overlap is pushed out in the first step). For
             traced values the `status` of each step shows the failure instead, and `first_failure` gives the step.
         TypeError: As in `step`.
@@ -164,15 +167,26 @@ def rollout(
     `pushjax.simulation.step` has the scheme.
     """
     check_solver(solver)
-    slider, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
+    if isinstance(slider, tuple | list):
+        if solver is not None or table is not None:
+            raise ValueError("solver and table are for one slider; got one with several sliders")
+        sliders, hand, path_array, start, mu = checked_sliders_arguments(slider, hand, path, pose, friction, between)
+    else:
+        if between is not None:
+            raise ValueError("between is for several sliders; got one")
+        sliders, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
     fixed = checked_fixtures(fixtures, start.dtype)
-    check_start_among_fixtures(slider, fixed, start)
-    checked = slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed
+    several = sliders if isinstance(sliders, tuple) else (sliders,)
+    for one, its_start in zip(several, start.reshape(-1, 3), strict=True):
+        check_start_among_fixtures(one, fixed, its_start)
+    checked = sliders, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed
     return _rollout(*checked) if is_staging() else _rollout_with_padding(*checked)
 
 
 @quick_jit
 def _rollout(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
+    if isinstance(slider, tuple):
+        return simulate_sliders(slider, hand, path, pose, friction[0], friction[1], fixtures, num_steps)
     uniform = form_and_friction(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
     return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures, num_steps)
@@ -196,11 +210,6 @@ def _first_steps(push: Trajectory, steps: int) -> Trajectory:
     return Trajectory(
         **{name: getattr(push, name)[: steps + extra.get(name, 0)] for name in Trajectory.__dataclass_fields__}
     )
-
-
-# Called as `friction_at(step, pose)` with the index of a step and the pose of the slider before it. Returns H of the
-# limit surface, and the coefficient of friction mu of each finger.
-FrictionAt = Callable[[Array, Vec3], tuple[Form, Array]]
 
 
 def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
@@ -229,65 +238,11 @@ def simulate(
 ) -> Trajectory:
     """Roll out a path, with arguments that have been checked. `rollout` is the public function."""
     push, first_pose = prepared_push(shape, hand, path, pose, solver, friction_at, fixtures)
-    push, start, steps = push._replace(num_steps=num_steps), Vec3.of(first_pose), len(path) - 1
+    push, start = push._replace(num_steps=num_steps), Vec3.of(first_pose)
     if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
         records = simulate_in_whole_steps(push, start)
         fraction = jnp.zeros_like(start.x)
     else:
         records, fraction = simulate_in_substeps(push, start)
     length = push.friction_at(jnp.zeros((), jnp.int32), start)[0].length
-    results = to_arrays(records, length)
-    stop_step = first_true(hand_stops(results.status))
-    last_done = jnp.where(stop_step >= 0, stop_step, steps)
-    index = jnp.arange(steps + 1)
-    # if the step of the jam was divided, the hand did the first part of it
-    last_displacement = jax.lax.stop_gradient(fraction) * (path[jnp.minimum(last_done + 1, steps)] - path[last_done])
-    configuration = path[jnp.minimum(index, last_done)]
-    configuration += jnp.where((index > last_done)[:, None], last_displacement[None], 0.0)
-    poses = jnp.concatenate([first_pose[None], results.pose])
-    poses = jnp.where(poses_are_moderate(pose, length), poses, pose)
-    other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
-    return Trajectory(pose=poses, configuration=configuration, **other_fields)
-
-
-def prepared_push(
-    shape: Shape,
-    hand: Hand,
-    path: Array,
-    pose: Array,
-    solver: ContactSolver | StickingSolver | None,
-    friction_at: FrictionAt,
-    fixtures: Fixtures = (),
-) -> tuple[PreparedPush, Array]:
-    """Return what a rollout needs of a push, and its first pose, (3,), both without invalid numbers (`domain`)."""
-    length = friction_at(jnp.zeros((), jnp.int32), Vec3.of(jnp.zeros_like(pose)))[0].length
-    shape_valid, hand_valid, fixtures_valid, pose_valid = (
-        are_valid((shape,), length),
-        are_valid(hand.fingers, length),
-        are_valid(fixtures, length),
-        poses_are_moderate(pose, length),
-    )
-    poses, row_valid = valid_path(hand, path, length)
-    row_valid &= shape_valid & hand_valid & fixtures_valid & pose_valid
-    shape, hand, fixtures = (
-        replace_invalid(bodies, valid, length)
-        for bodies, valid in ((shape, shape_valid), (hand, hand_valid), (fixtures, fixtures_valid))
-    )
-
-    def rows_at(step: Array, rows: Array) -> tuple[Array, Array]:
-        return tuple(jax.lax.dynamic_index_in_dim(rows, step + k, keepdims=False) for k in (0, 1))
-
-    def motions_at(step: Array, mu: Array):
-        (before, after), (valid_before, valid_after) = rows_at(step, poses), rows_at(step, row_valid)
-        before, after = jnp.where(valid_before, before, after), jnp.where(valid_after, after, before)
-        return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
-
-    def friction_if_valid(step: Array, pose: Vec3) -> tuple[Form, Array]:
-        form, mu = friction_at(step, pose)
-        valid_before, valid_after = rows_at(step, row_valid)
-        return form, jnp.where(valid_before & valid_after & (mu <= MAX_FRICTION), mu, jnp.nan)
-
-    push = PreparedPush(
-        shape.outline(), len(path) - 1, motions_at, solver, friction_if_valid, fixture_motions(fixtures)
-    )
-    return push, jnp.where(pose_valid, pose, 0.0)
+    return trajectory_of(records, length, path, first_pose, fraction, pose, poses_are_moderate(pose, length))

@@ -25,7 +25,7 @@ slider from the whole outline. `substeps` divides a step that is too long.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -239,8 +239,8 @@ def compute_step(
     before = Stage.before(start, counts, urgency, guess)
     last, _ = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
     moved_pose = start.moved(last.middle, last.solution.twist, last.angle).pose
-    status = _status(last, motions, fixtures, overlap_before, form.length)
-    return _keep_pose_unless_moving(last, moved_pose, pose, status), last
+    status = status_of(last, motions, fixtures, overlap_before, form.length)
+    return keep_pose_unless_moving(last, moved_pose, pose, status), last
 
 
 def _holds(near: tuple[Bool[Array, ""], ...], num_fingers: int) -> Bool[Array, ""]:
@@ -251,8 +251,8 @@ def _holds(near: tuple[Bool[Array, ""], ...], num_fingers: int) -> Bool[Array, "
     return holds
 
 
-def _status(
-    last: Stage,
+def status_of(
+    last: Any,  # `Stage`, or that of several sliders
     motions: tuple[FingerMotion, ...],
     fixtures: tuple[FingerMotion, ...],
     depth: Scalar,
@@ -310,14 +310,14 @@ def _force_weighted_point(contacts: Contact, force: Vec2) -> Vec2:
     return Vec2(jnp.sum(share * contacts.point.x), jnp.sum(share * contacts.point.y))
 
 
-def _keep_pose_unless_moving(last: Stage, moved_pose: Vec3, pose: Vec3, status: Int[Array, ""]) -> StepRecord:
-    """Return the record of a step; a slider that does not move keeps its pose bit for bit."""
+def keep_pose_unless_moving(last: Any, moved_pose: Vec3, pose: Vec3, status: Int[Array, ""]) -> StepRecord:
+    """Return the record of a step; sliders keep their poses bit for bit unless the status is MOVING."""
     # A motion that is not finite becomes the status INVALID, and the slider keeps its pose, too.
-    finite_pose = jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)
-    moves = compute_once((status == Status.MOVING) & finite_pose, pose.x)
+    finite_pose, one = jnp.all(jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)), jnp.sum(pose.x)
+    moves = compute_once((status == Status.MOVING) & finite_pose, one)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
     pose, solution = tree_where(moves, moved_pose, pose), last.solution
     vectors = solution.twist, solution.wrench, solution.force, last.point, last.normal
     twist, wrench, force, point, normal = jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), vectors)
     mode = jnp.where(moves, solution.mode, ContactMode.SEPARATED).astype(jnp.int8)
-    return StepRecord(pose, twist, wrench, force, point, normal, mode, status, jnp.zeros_like(pose.x))
+    return StepRecord(pose, twist, wrench, force, point, normal, mode, status, jnp.zeros_like(one))

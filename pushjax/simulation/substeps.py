@@ -47,7 +47,7 @@ from pushjax.simulation.finger_motion import (
     max_penetration,
 )
 from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
-from pushjax.simulation.step import Stage, StepRecord, compute_step, hand_stops
+from pushjax.simulation.step import StepRecord, compute_step, hand_stops
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
 SMALLEST_PART = 1 / 256  # of a step
@@ -84,7 +84,7 @@ class PushState(NamedTuple):
     failed: Bool[Array, ""]  # whether the previous step failed
     twist: Vec3  # of the slider, the sum over the parts of the step that are done, body frame
     source: Int[Array, ""]  # number of the trial of the last part in which the slider moved in this step, or -1
-    guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
+    guess: Any  # what the next contact problem may start from; None with one contact
 
 
 class Outcome(NamedTuple):
@@ -133,28 +133,9 @@ class PreparedPush(NamedTuple):
         first = jnp.zeros((), jnp.int32)
         motions = self.motions_at(first, self.friction_at(first, pose)[1])
         overlap = max_penetration(self.outline, motions + self.fixtures, pose, 0.0)
-        zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
-        none, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
-        return PushState(
-            pose=pose,
-            origin=pose,
-            step=first,
-            done=zero,
-            part=one,
-            halved=no,
-            whole_step_jams=no,
-            urgency=initial_urgency(counts, pose.x),
-            braced=no,
-            swaps=none,
-            overlap=overlap,
-            stop_status=none,
-            abandon_status=none,
-            failed=no,
-            twist=Vec3(zero, zero, zero),
-            source=jnp.full((), NO_TRIAL, jnp.int32),
-            guess=EdgeSet.none(zero) if sum(counts) > 1 else None,
-        )
+        guess = EdgeSet.none(overlap) if sum(counts) > 1 else None
+        return first_state(pose, overlap, guess, initial_urgency(counts, overlap))
 
     def trial(self, state: PushState, number: Int[Array, ""]) -> tuple[PushState, tuple[StepRecord, StepEnd]]:
         """Try the next part of a step: the state after it, the record of the part, and how the step ended."""
@@ -183,22 +164,50 @@ class PreparedPush(NamedTuple):
             guess=state.guess,
         )
         is_smallest = state.part < 2 * SMALLEST_PART
+
+        def depth_at(pose: Vec3) -> Scalar:
+            return max_penetration(self.outline, part + fixtures, pose, 1.0)
+
         speed = judge_speed(record.twist, last_stage.middle, state.part * displacement, form.length, is_smallest)
-        next_state, end = _next_state(
-            state, record, number, last_stage, self.outline, part + fixtures, tolerance, speed, self.end
-        )
+        following, end = next_state(state, record, number, last_stage, depth_at, tolerance, speed, self.end)
         urgency = initial_urgency(self._counts(motions), state.pose.x)
         if last_stage.urgency_after is not None and urgency is not None:
-            next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, last_stage.urgency_after, urgency))
-        return next_state, (record, end)
+            following = following._replace(urgency=jnp.where(following.swaps > 0, last_stage.urgency_after, urgency))
+        return following, (record, end)
 
     def _counts(self, motions: tuple[FingerMotion, ...]) -> list[int]:
         """Return the number of contacts of each finger and fixture."""
         return [num_contacts(motion.finger, self.outline) for motion in motions + self.fixtures]
 
 
-def simulate_in_substeps(push: PreparedPush, pose: Vec3) -> tuple[StepRecord, Scalar]:
-    """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
+def first_state(pose: Vec3, overlap: Scalar, guess: Any, urgency: Urgency | None = None) -> PushState:
+    """Return the state before the first trial, given the depth of the deepest body, m."""
+    zero, none, no = jnp.zeros_like(overlap), jnp.zeros((), jnp.int8), jnp.zeros((), bool)
+    return PushState(
+        pose=pose,
+        origin=pose,
+        step=jnp.zeros((), jnp.int32),
+        done=zero,
+        part=jnp.ones_like(overlap),
+        halved=no,
+        whole_step_jams=no,
+        urgency=urgency,
+        braced=no,
+        swaps=none,
+        overlap=overlap,
+        stop_status=none,
+        abandon_status=none,
+        failed=no,
+        twist=jax.tree.map(jnp.zeros_like, pose),
+        source=jnp.full((), NO_TRIAL, jnp.int32),
+        guess=guess,
+    )
+
+
+def simulate_in_substeps(push: Any, pose: Vec3) -> tuple[StepRecord, Scalar]:
+    """Roll out a `PreparedPush`, or one of several sliders.
+
+    Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
     initial_state, numbers = push.first_state(pose), jnp.arange(max_trials(push.steps), dtype=jnp.int32)
 
     def is_ongoing(state: PushState, number: Int[Array, ""]) -> Bool[Array, ""]:
@@ -229,7 +238,8 @@ def _records_of_steps(records: StepRecord, ends: StepEnd, steps: int, last: Push
 
         def of(rows: Array, otherwise: Any) -> Array:
             is_known = (number >= 0).reshape(-1, *(1,) * (rows.ndim - 1))
-            return jnp.where(is_known, rows[jnp.maximum(number, 0)], otherwise)
+            rows = rows[jnp.maximum(number, 0)]
+            return jnp.where(is_known, rows, jnp.broadcast_to(otherwise, rows.shape))
 
         return jax.tree.map(of, rows, otherwise)
 
@@ -253,7 +263,7 @@ class Decision(NamedTuple):
 def _decide(
     state: PushState,  # before the trial
     record: StepRecord,  # of the trial
-    last_stage: Stage,
+    last_stage: Any,
     depth: Scalar,  # of the deepest finger after the trial, m
     tolerance: Scalar,  # how much deeper a finger may be after a whole step, m
     speed: SpeedJudgment,
@@ -277,7 +287,7 @@ def _decide(
         worst = jnp.max(jnp.where(urgency_after < LOADED, urgency_after, -jnp.inf))
         joins = is_solved & ~fails & (state.swaps < MAX_SWAPS) & (worst > MISSED_FRACTION * state.part * tolerance)
     accepted = is_solved & clear & ~fails & ~joins & ~state.braced
-    accepted, stops, joins = compute_once((accepted, stops, joins), state.pose.x)
+    accepted, stops, joins = compute_once((accepted, stops, joins), state.done)
     is_bad, is_smallest = record.status >= Status.OVERLAPPING, state.part / 2 < SMALLEST_PART
     hopeless = (is_smallest | state.failed | is_bad) & ~accepted & ~stops & ~fails & ~joins
     braces = hopeless & is_smallest & ~is_bad & ~state.braced & (record.force.x.size > 1)
@@ -287,29 +297,28 @@ def _decide(
     ends_at_once = abandons & ~is_solved & (state.part == 1)
     reason = jnp.where(is_solved, Status.NOT_CONVERGED, record.status)
     reason = jnp.where(fails, state.abandon_status, reason).astype(jnp.int8)
-    fails = compute_once(fails | ends_at_once, state.pose.x)
+    fails = compute_once(fails | ends_at_once, state.done)
     return Decision(accepted, joins, braces, stops, abandons & ~ends_at_once, fails, reason)
 
 
-def _next_state(
+def next_state(
     state: PushState,
     record: StepRecord,
     number: Int[Array, ""],  # of the trial
-    last_stage: Stage,
-    outline: Outline,
-    part: tuple[FingerMotion, ...],  # motions over the tried part of the step, and fixtures
+    last_stage: Any,  # `Stage`, or that of several sliders
+    depth_at: Callable[[Vec3], Scalar],  # of the deepest body after the trial, with the slider at a pose, m
     tolerance: Scalar,
     speed: SpeedJudgment,
     steps: Int[Array, ""] | int,
 ) -> tuple[PushState, StepEnd]:
     """Return the state after a trial, and how its step ended."""
     ongoing = state.step < steps
-    pose = tree_where(compute_once(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
-    depth = max_penetration(outline, part, pose, 1.0)
+    pose = tree_where(compute_once(state.abandon_status != 0, state.done), state.origin, record.pose)
+    depth = depth_at(pose)
     decision = _decide(state, record, last_stage, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
-    moves = compute_once(record.status == Status.MOVING, pose.x)
+    moves = compute_once(record.status == Status.MOVING, state.done)
     twist, source = state.twist + record.twist, jnp.where(moves, number, state.source)
     done = state.done + state.part
     ends = ongoing & (fails | stops | (accepted & (done >= 1)))
@@ -321,13 +330,13 @@ def _next_state(
     outcome = tree_where(stops, stopped, tree_where(accepted, passed, failed))
 
     # the next trial: where it starts, and how large its part is
-    continues = compute_once(accepted & ~ends, pose.x)
+    continues = compute_once(accepted & ~ends, state.done)
     restarts = (ends & ~stops) | decision.abandons
     jams = (state.part == 1) & hand_stops(record.status)
     again = decision.joins | decision.braces
     smaller = jnp.where(again, state.part, jnp.where(jams, EVENT_PART, state.part / 2))
     larger = jnp.where(state.halved | ~speed.allowed_in_double, state.part, 2 * state.part)
-    next_state = PushState(
+    following = PushState(
         pose=tree_where(ends, outcome.pose, tree_where(continues, pose, state.pose)),
         origin=tree_where(ends, outcome.pose, state.origin),
         step=jnp.where(ends, jnp.where(stops, steps, state.step + 1), state.step),
@@ -346,5 +355,5 @@ def _next_state(
         source=jnp.where(ends, NO_TRIAL, jnp.where(continues, source, state.source)),
         guess=None if state.guess is None else tree_where(accepted & moves, last_stage.solution.best, state.guess),
     )
-    next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
-    return next_state, StepEnd(ends, state.step, outcome)
+    following = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), following, state)
+    return following, StepEnd(ends, state.step, outcome)

@@ -1,6 +1,7 @@
 """Results of pushes: of one step, and of a path of steps."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -115,8 +116,34 @@ def first_true(mask: Bool[Array, "... steps"]) -> Int[Array, "..."]:
 def to_arrays(record: StepRecord, length: Scalar) -> Step:
     """Return the record of one step as arrays, or a stacked record, whose entries have an axis of steps."""
     # the torque of the record is divided by the length of the limit surface
-    record = record._replace(wrench=record.wrench._replace(z=record.wrench.z * length))
+    record = record._replace(
+        wrench=record.wrench._replace(z=record.wrench.z * jnp.broadcast_to(length, record.wrench.z.shape))
+    )
     fields = record._asdict()
     return Step(
         **{name: jnp.stack(entry, axis=-1) if isinstance(entry, tuple) else entry for name, entry in fields.items()}
     )
+
+
+def trajectory_of(
+    records: StepRecord,  # stacked
+    length: Scalar,  # of the limit surface, m; or those of several sliders
+    path: Float[Array, "steps+1 dof"],
+    first_pose: Float[Array, "*sliders 3"],  # that was computed with
+    fraction: Scalar,  # of the last step that a stopped hand did
+    pose: Float[Array, "*sliders 3"],  # that was given
+    valid: Bool[Array, ""],  # whether this pose is one that can be computed with
+) -> Trajectory:
+    """Return the records of all steps as a trajectory."""
+    results, steps = to_arrays(records, length), len(path) - 1
+    stop_step = first_true(hand_stops(results.status))
+    last_done = jnp.where(stop_step >= 0, stop_step, steps)
+    index = jnp.arange(steps + 1)
+    # if the step of the jam was divided, the hand did the first part of it
+    last_displacement = jax.lax.stop_gradient(fraction) * (path[jnp.minimum(last_done + 1, steps)] - path[last_done])
+    configuration = path[jnp.minimum(index, last_done)]
+    configuration += jnp.where((index > last_done)[:, None], last_displacement[None], 0.0)
+    poses = jnp.concatenate([first_pose[None], results.pose])
+    poses = jnp.where(valid, poses, jnp.broadcast_to(pose, poses.shape))
+    other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
+    return Trajectory(pose=poses, configuration=configuration, **other_fields)

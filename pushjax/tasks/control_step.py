@@ -23,7 +23,8 @@ from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.simulation.finger_motion import DEPTH_PER_DISPLACEMENT
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand, RoundFinger
-from pushjax.simulation.rollout import FrictionAt, prepared_push, simulate
+from pushjax.simulation.prepared_push import FrictionAt, prepared_push
+from pushjax.simulation.rollout import simulate
 from pushjax.simulation.substeps import PreparedPush, PushState, max_trials
 from pushjax.simulation.trajectory import Trajectory
 from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, separate

@@ -1,0 +1,264 @@
+"""One step of several sliders that touch each other, or a part of one.
+
+The scheme is that of one slider (`step`): free motion, predictor and corrector. Each slider has its own frame. Where
+two sliders meet, the second one is to the first like a finger whose motion is not known. All contacts are solved
+together (`sliders_solving`).
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from pushjax._internal.xla import compute_once
+from pushjax._math.vec import Scalar, Vec2, Vec3
+from pushjax.contact.contact_plane import Contact
+from pushjax.contact.sliders_solving import SlidersSolution, Start, Touching, solve_touching
+from pushjax.contact.status import ContactMode, Status
+from pushjax.friction.limit_surface import Form
+from pushjax.geometry.disk import Disk
+from pushjax.geometry.polygon import Polygon
+from pushjax.geometry.shape import Outline, Shape
+from pushjax.simulation.candidate import Features, Touches, joined
+from pushjax.simulation.detection import num_contacts
+from pushjax.simulation.finger_motion import BodyFrame, FingerMotion, max_penetration
+from pushjax.simulation.fixtures import Wall
+from pushjax.simulation.hand import Finger
+from pushjax.simulation.impact import time_of_impact
+from pushjax.simulation.step import (
+    MAX_ROTATION_PER_STEP,
+    MAX_SLIP_PER_STEP,
+    PushingPart,
+    StepRecord,
+    keep_pose_unless_moving,
+    status_of,
+)
+
+
+class Body(NamedTuple):
+    """A slider: its outline, itself as a finger that pushes others, and its friction with each slider."""
+
+    outline: Outline
+    finger: Finger | None  # None for a slider that is not convex, which cannot push another one that is not either
+    center: Vec2  # of the finger, in the frame of the slider, m
+    friction: Scalar  # with each slider, (sliders,)
+
+    def as_finger(self, frame: BodyFrame, other: int) -> FingerMotion:
+        """Return the slider as a finger of another one that stays where it is."""
+        assert self.finger is not None
+        zero = jnp.zeros_like(frame.pose.x)
+        center = frame.pose.xy + self.center.rotate(frame.angle)
+        return FingerMotion(self.finger, self.friction[other], center, Vec2(zero, zero), frame.pose.z, zero)
+
+
+def can_push(shape: Shape) -> bool:
+    """Return whether a slider of this shape can be as a finger to others: whether it is a disk or a convex polygon."""
+    return isinstance(shape, Disk) or (isinstance(shape, Polygon) and shape.convex)
+
+
+class Meeting(NamedTuple):
+    """A slider, and what it may meet: a finger or a fixture, or another slider."""
+
+    slider: int
+    body: FingerMotion | None  # None for a slider
+    other: int | None  # None for a finger or a fixture
+    is_fixture: bool
+
+    def found_at(self, frames: tuple[BodyFrame, ...], bodies: tuple[Body, ...]) -> FingerMotion:
+        """Return what the slider meets, while the sliders are at these frames."""
+        if self.other is None:
+            assert self.body is not None
+            return self.body
+        return bodies[self.other].as_finger(frames[self.other], self.slider)
+
+
+class SlidersStage(NamedTuple):
+    """What the predictor passes to the corrector, and what the corrector leaves; as `Stage` for each slider."""
+
+    solution: SlidersSolution
+    middle: tuple[Vec2, ...]
+    angle: tuple[Vec2, ...]
+    point: Vec2  # of each contact, in the frame of its first slider
+    normal: Vec2
+    at_start: tuple[Touches, ...]  # of each meeting
+    holds: Bool[Array, ""]
+    is_long: Bool[Array, ""]
+    slides_off: Bool[Array, ""]
+    urgency_after: None = None  # all contacts are solved together
+
+
+def meetings_of(
+    bodies: tuple[Body, ...], motions: tuple[FingerMotion, ...], fixtures: tuple[FingerMotion, ...]
+) -> list[Meeting]:
+    """Return everything that may meet, the fingers of all sliders first, then fixtures, then sliders."""
+    count = len(bodies)
+    meetings = [Meeting(i, motion, None, False) for i in range(count) for motion in motions]
+    meetings += [Meeting(i, fixture, None, True) for i in range(count) for fixture in fixtures]
+    for i in range(count):
+        for j in range(i):
+            # the one that is not convex, if there is one, is the outline
+            first, second = (i, j) if bodies[j].finger is not None else (j, i)
+            meetings.append(Meeting(first, None, second, True))
+    return meetings
+
+
+def depth_of_sliders(bodies: tuple[Body, ...], meetings: list[Meeting], pose: Vec3, fraction: float) -> Scalar:
+    """Return the depth of the deepest finger, fixture or slider in a slider after `fraction` of the step, m."""
+    poses = tuple(Vec3(pose.x[i], pose.y[i], pose.z[i]) for i in range(len(bodies)))
+    frames = tuple(BodyFrame.at(each) for each in poses)
+    depths = [
+        max_penetration(
+            bodies[m.slider].outline,
+            (m.found_at(frames, bodies),),
+            poses[m.slider],
+            0.0 if m.other is not None else fraction,
+        )
+        for m in meetings
+    ]
+    return functools.reduce(jnp.maximum, depths)
+
+
+class _PushingPart(NamedTuple):
+    """The part of a step in which the fingers push, after the free motion; as `PushingPart` for each slider."""
+
+    forms: tuple[Form, ...]
+    bodies: tuple[Body, ...]
+    meetings: list[Meeting]
+    starts: tuple[BodyFrame, ...]
+    parts: list[PushingPart]  # of each slider
+    features: list[Features]  # of each meeting
+    sizes: list[int]  # contacts of each meeting
+    num_fingers: int
+    ongoing: Bool[Array, ""] | bool
+
+    def stage(self, before: SlidersStage, fraction: Scalar) -> tuple[SlidersStage, None]:
+        """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
+        meetings, bodies = self.meetings, self.bodies
+        frames = self.moved(before, fraction)
+        found = [
+            self.parts[m.slider].contacts_of(
+                frames[m.slider], fraction, m.is_fixture, m.found_at(frames, bodies), own, old
+            )
+            for m, own, old in zip(meetings, self.features, before.at_start, strict=True)
+        ]
+        contacts, at_start, near, past = zip(*found, strict=True)
+        contact, exists = joined(*contacts), joined(*at_start).exists
+        point, normal = joined(*[_in_second(m, each, frames) for m, each in zip(meetings, contacts, strict=True)])
+        works = before.solution.status <= Status.FREE  # else the step has failed, and the corrector solves nothing
+        pairs = tuple(
+            pair for m, size in zip(meetings, self.sizes, strict=True) for pair in [(m.slider, m.other)] * size
+        )
+        touching = Touching(contact, point, normal, pairs, exists & self.ongoing & works)
+        solution = solve_touching(self.forms, touching, before.solution.best)
+        is_long = (solution.status <= Status.FREE) & self._moves_too_far(solution, contact, exists)
+        return SlidersStage(
+            solution=solution._replace(status=jnp.where(works, solution.status, before.solution.status)),
+            middle=tuple(_middle(i, pairs, contact.point, point, solution.force.x) for i in range(len(bodies))),
+            angle=tuple(frame.angle for frame in frames),
+            point=jax.lax.stop_gradient(contact.point),
+            normal=jax.lax.stop_gradient(contact.normal),
+            at_start=at_start,
+            holds=_holds(meetings, near, self.num_fingers),
+            is_long=before.is_long | is_long,
+            slides_off=jnp.any(jnp.concatenate(past) & (solution.force.x > 0)),
+        ), None
+
+    def moved(self, stage: SlidersStage, fraction: Scalar | float) -> tuple[BodyFrame, ...]:
+        """Return the frames after a fraction of the motion of a stage."""
+        twist = stage.solution.twist.scale(jnp.asarray(fraction, stage.solution.twist.x.dtype))
+        each = zip(self.starts, stage.middle, zip(*twist, strict=True), stage.angle, strict=True)
+        return tuple(start.moved(middle, Vec3(*twist), angle) for start, middle, twist, angle in each)
+
+    def _moves_too_far(
+        self, solution: SlidersSolution, contact: Contact, exists: Bool[Array, "contacts"]
+    ) -> Bool[Array, ""]:
+        """Return whether a slider turns, or slips at a contact that is not on a wall, too far for one step."""
+        slip = jax.lax.stop_gradient(Vec2(solution.slip.x - contact.gap, solution.slip.y))
+        ends = [m.body is None or not isinstance(m.body.finger, Wall) for m in self.meetings]
+        counted = exists & jnp.asarray([end for end, size in zip(ends, self.sizes, strict=True) for _ in range(size)])
+        slips = jnp.any(counted & (slip.dot(slip) > (MAX_SLIP_PER_STEP * shortest(self.forms)) ** 2))
+        return slips | jnp.any(jnp.abs(solution.twist.z) > MAX_ROTATION_PER_STEP)
+
+
+def shortest(forms: tuple[Form, ...]) -> Scalar:
+    """Return the shortest length of limit surfaces, m."""
+    return functools.reduce(jnp.minimum, [form.length for form in forms])
+
+
+def compute_sliders_step(
+    forms: tuple[Form, ...],
+    bodies: tuple[Body, ...],
+    motions: tuple[FingerMotion, ...],
+    fixtures: tuple[FingerMotion, ...],
+    pose: Vec3,  # of the sliders at the start, world, (sliders,) each
+    overlap_before: Scalar,  # depth of the deepest body at the start, m
+    reach: Scalar,  # distance within which a finger holds jammed sliders, m
+    guess: Start,
+    ongoing: Bool[Array, ""] | bool = True,
+) -> tuple[StepRecord, SlidersStage]:
+    """Compute one step of all fingers, or a part of one: its record, and the last stage."""
+    meetings = meetings_of(bodies, motions, fixtures)
+    starts = tuple(BodyFrame.at(Vec3(*each)) for each in zip(*pose, strict=True))
+    each = list(zip(bodies, starts, forms, strict=True))
+    instants = [time_of_impact(motions, body.outline, start, form.length) for body, start, form in each]
+    begin = compute_once(functools.reduce(jnp.minimum, instants), overlap_before)
+    parts = [PushingPart(body.outline, form.length, start, begin, 1 - begin, reach) for body, start, form in each]
+    found = [m.found_at(starts, bodies) for m in meetings]
+    features = [parts[m.slider].features_of(body) for m, body in zip(meetings, found, strict=True)]
+    sizes = [num_contacts(body.finger, bodies[m.slider].outline) for m, body in zip(meetings, found, strict=True)]
+    part = _PushingPart(forms, bodies, meetings, starts, parts, features, sizes, len(motions), ongoing)
+    before = _before(starts, sizes, guess, overlap_before)
+    last, _ = jax.lax.scan(part.stage, before, jnp.array([0.0, 0.5], overlap_before.dtype))
+    moved = jax.tree.map(lambda *entries: jnp.stack(entries), *(frame.pose for frame in part.moved(last, 1.0)))
+    # a slider that rests keeps its pose bit for bit
+    moved = jax.tree.map(lambda new, old: jnp.where(last.solution.rests, old, new), moved, pose)
+    status = status_of(last, motions, fixtures, overlap_before, shortest(forms))
+    return keep_pose_unless_moving(last, moved, pose, status), last
+
+
+def _before(starts: tuple[BodyFrame, ...], sizes: list[int], guess: Start, like: Scalar) -> SlidersStage:
+    """Return what the predictor starts from: no motion yet, and no contacts found."""
+    zero, no, total = jnp.zeros_like(like), jnp.zeros((), bool), sum(sizes)
+    rows = [jnp.zeros(size, zero.dtype) for size in sizes]
+    nowhere = tuple(Touches(row, Vec2(row, row), Vec2(row, row), row > 0) for row in rows)
+    of_sliders, of_contacts = jnp.zeros(len(starts), zero.dtype), jnp.zeros(total, zero.dtype)
+    still, columns = Vec3(of_sliders, of_sliders, of_sliders), Vec2(of_contacts, of_contacts)
+    mode, moving = jnp.full(total, ContactMode.SEPARATED, jnp.int8), jnp.full((), Status.MOVING, jnp.int8)
+    solution = SlidersSolution(still, still, columns, columns, mode, of_sliders == 0, moving, guess)
+    middle = tuple(Vec2(zero, zero) for _ in starts)
+    angle = tuple(start.angle for start in starts)
+    return SlidersStage(solution, middle, angle, columns, columns, nowhere, no, no, no)
+
+
+def _in_second(meeting: Meeting, contact: Contact, frames: tuple[BodyFrame, ...]) -> tuple[Vec2, Vec2]:
+    """Return points and normals of contacts in the frame of the second slider; as they are if there is none."""
+    if meeting.other is None:
+        return contact.point, contact.normal
+    first, second = frames[meeting.slider], frames[meeting.other]
+    place = Vec2(first.pose.x, first.pose.y) + contact.point.rotate(first.angle)
+    return second.local(place), contact.normal.rotate(first.angle).unrotate(second.angle)
+
+
+def _middle(slider: int, pairs: tuple[tuple[int, int | None], ...], first: Vec2, second: Vec2, force: Scalar) -> Vec2:
+    """Return the mean of the contact points of a slider, weighted by normal force, in its frame, m."""
+    is_first = jnp.asarray([pair[0] == slider for pair in pairs])
+    is_second = jnp.asarray([pair[1] == slider for pair in pairs])
+    point = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), first, second)
+    weight = jnp.where(is_first | is_second, force, 0.0)
+    total = jnp.sum(weight)
+    share = weight / jnp.where(total > 0, total, 1.0)
+    return Vec2(jnp.sum(share * point.x), jnp.sum(share * point.y))
+
+
+def _holds(meetings: list[Meeting], near: tuple[Array, ...], count: int) -> Bool[Array, ""]:
+    """Return whether each of several fingers is near enough to a slider to hold jammed sliders, and no fixture is."""
+    holds = jnp.asarray(count > 1)
+    own = [is_near for m, is_near in zip(meetings, near, strict=True) if m.other is None and not m.is_fixture]
+    for k in range(count):
+        holds &= jnp.any(jnp.stack(own[k::count]))
+    for m, is_near in zip(meetings, near, strict=True):
+        if m.other is None and m.is_fixture:
+            holds &= ~is_near
+    return holds
