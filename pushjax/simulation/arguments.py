@@ -135,9 +135,9 @@ def checked_sliders_arguments(
     if len(concave) > 1:
         raise ValueError(f"slider: of each two, one must be a disk or a convex polygon; sliders {concave} are not")
     each = [checked_rollout_arguments(s, hand, path, start[k], friction) for k, s in enumerate(sliders)]
-    cast = tuple(jax.tree.map(lambda leaf: leaf.astype(dtype), one[0]) for one in each)
+    # all are of the dtype of `start`
     _, hand, path_array, _, mu = each[0]
-    return cast, hand, path_array, start, (mu, mutual)
+    return tuple(one[0] for one in each), hand, path_array, start, (mu, mutual)
 
 
 def _check_columns(path: Array, hand: Hand) -> None:

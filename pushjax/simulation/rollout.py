@@ -146,7 +146,7 @@ def rollout(
         The push, step by step. Of several sliders, pose, twist and wrench have an axis for them. The contacts are those
         of the first slider with each finger, of the second one, and so on; then those with fixtures; then those of
         sliders 1 and 0, 2 and 0, 2 and 1, and so on. They are in the frame of the first of the two, or of the second
-        one if only that one is not convex.
+        one if only that one is not convex. A slider that rests has a zero twist, and a wrench inside its limit surface.
 
     Raises:
         ValueError: As in `step`; for several sliders also without `between`, or with a solver or a table, which are

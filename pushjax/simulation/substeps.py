@@ -205,9 +205,8 @@ def first_state(pose: Vec3, overlap: Scalar, guess: Any, urgency: Urgency | None
 
 
 def simulate_in_substeps(push: Any, pose: Vec3) -> tuple[StepRecord, Scalar]:
-    """Roll out a `PreparedPush`, or one of several sliders.
-
-    Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
+    """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
+    # `push` is a `PreparedPush`, or a `PreparedSliders`
     initial_state, numbers = push.first_state(pose), jnp.arange(max_trials(push.steps), dtype=jnp.int32)
 
     def is_ongoing(state: PushState, number: Int[Array, ""]) -> Bool[Array, ""]:

@@ -10,10 +10,9 @@ from scenes_of_sliders import Scenes, grid, pile, scenes, violations
 
 import pushjax as pj
 from pushjax.contact.problem import contacts_in_columns
-from pushjax.contact.scaled_problem import nondimensionalize
+from pushjax.contact.scaled_problem import ContactArrays, nondimensionalize
 from pushjax.contact.several_sliders import differentiable_motion, solve_sliders
 from pushjax.contact.sliders_problem import SlidersProblem
-from pushjax.contact.solving import _arrays
 from pushjax.contact.status import Status
 from pushjax.friction.polynomial import Polynomial
 
@@ -113,7 +112,11 @@ def test_one_slider_moves_as_by_the_solver_of_one(degree):
 
     def of_one(surface, contacts):
         form, contact = surface.form(), contacts_in_columns(contacts, contacts.friction)
-        return nondimensionalize(_arrays((form, contact, contacts.active)))
+        vectors = (each.array() for each in (contact.point, contact.normal, contact.displacement))
+        table = Polynomial.of(form.table())
+        return nondimensionalize(
+            ContactArrays(table, form.length, *vectors, contact.gap, contact.friction, contacts.active)
+        )
 
     scaled = jax.vmap(of_one, out_axes=-1)(batch.surface, batch.contacts)
     rows = jnp.stack([scaled.normal, scaled.tangent])[:, :, None]
