@@ -15,13 +15,46 @@ Arrays have components first, then sliders, and the batch last.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax.friction.polynomial import Polynomial
+from pushjax.friction.support_points import SupportPoints
 
-# Directions of wrenches whose ellipsoids are averaged for a first law: along the axes and the diagonals.
-DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, 1], [1, 1, -1], [1, -1, -1]])
+
+class MixedSurfaces(NamedTuple):
+    """The limit surfaces of sliders, some of which are exact."""
+
+    polynomial: Polynomial
+    points: SupportPoints
+    is_exact: Bool[Array, "sliders *batch"]
+
+    def patch(self, wrench: Float[Array, "3 *rest sliders batch"]) -> tuple[Array, Array, Array]:
+        """As of each kind."""
+        both = zip(self.points.patch(wrench), self.polynomial.patch(wrench), strict=True)
+        gauge, normal, curvature = (
+            jnp.where(jnp.broadcast_to(self.is_exact, exact.shape), exact, smooth) for exact, smooth in both
+        )
+        return gauge, normal, curvature
+
+    def mean_ellipsoid(self, wrench: Float[Array, "3 sliders batch"]) -> Float[Array, "3 3 sliders batch"]:
+        """As of each kind."""
+        exact, smooth = self.points.mean_ellipsoid(wrench), self.polynomial.mean_ellipsoid(wrench)
+        return jnp.where(jnp.broadcast_to(self.is_exact, exact.shape), exact, smooth)
+
+    def reweighted(self, twist: Array, ellipsoid: Array, weight: Array) -> tuple[Array, Array]:
+        """As of each kind."""
+        own, own_weight = self.points.reweighted(twist, ellipsoid, weight)
+        is_exact = jnp.broadcast_to(self.is_exact, weight.shape)
+        return jnp.where(is_exact[None, None], own, ellipsoid), jnp.where(is_exact, own_weight, weight)
+
+    def usable(self) -> tuple["MixedSurfaces", Bool[Array, " batch"]]:
+        """Those without numbers that cannot be computed with, and whether there were none."""
+        polynomial, are_finite = self.polynomial.usable()
+        points, are_valid = self.points.usable()
+        return MixedSurfaces(polynomial, points, self.is_exact), are_finite & are_valid
+
+
+Surface = Polynomial | SupportPoints | MixedSurfaces  # of all sliders; its arrays have axes for sliders and batch
 
 
 class LinearPatch(NamedTuple):
@@ -32,24 +65,14 @@ class LinearPatch(NamedTuple):
     curvature: Float[Array, "3 3 *rest sliders batch"]  # C
 
     @staticmethod
-    def at(surface: Polynomial, wrench: Float[Array, "3 *rest sliders batch"]) -> "LinearPatch":
+    def at(surface: "Surface", wrench: Float[Array, "3 *rest sliders batch"]) -> "LinearPatch":
         """The limit surface at a wrench; for a zero wrench, at another one, with a gauge of zero."""
-        degree, acts = surface.degree, surface.value(wrench) > 0
+        size = jnp.max(jnp.abs(wrench), axis=0)
+        acts = size > jnp.finfo(size.dtype).tiny ** 0.2  # of a smaller one, H may be zero
         axis = jnp.zeros_like(wrench).at[0].set(1.0)
-        wrench = jnp.where(acts[None], wrench, axis)
-        gauge = surface.root(surface.value(wrench))
-        wrench = wrench / gauge[None]
-        normal = surface.gradient(wrench) / degree
-        curvature = surface.hessian(wrench) / degree - (degree - 1) * normal[:, None] * normal[None]
+        gauge, normal, curvature = surface.patch(jnp.where(acts[None], wrench, axis))
         return LinearPatch(jnp.where(acts, gauge, 0.0), normal, curvature)
 
     def ellipsoid(self) -> Float[Array, "3 3 *rest sliders batch"]:
         """The matrix of the ellipsoid that agrees with the limit surface here."""
         return self.curvature + self.normal[:, None] * self.normal[None]
-
-
-def mean_ellipsoid(surface: Polynomial, like: Float[Array, "3 sliders batch"]) -> Float[Array, "3 3 sliders batch"]:
-    """The mean of the ellipsoids that agree with a limit surface at some wrenches."""
-    directions = jnp.asarray(DIRECTIONS.T, like.dtype)[:, :, None, None]
-    wrenches = jnp.broadcast_to(directions, (*directions.shape[:2], *like.shape[1:]))
-    return jnp.mean(LinearPatch.at(surface, wrenches).ellipsoid(), axis=2)

@@ -10,9 +10,9 @@ method solves. A round solves one LCP. There are two kinds of rounds:
 - A Newton round has the limit surfaces made linear at that wrench, with the dissipation s >= 0 as an unknown of each
   slider. It finds by itself which sliders rest, and converges quadratically. It may go astray.
 
-Newton rounds follow a round of weights as long as each halves the violation of the true conditions. A small part of
-the ellipsoid's law, of changes of the wrench, is added to the law of a Newton round. It vanishes where the rounds
-converge, and determines the forces between sliders that rest.
+Newton rounds follow the first, second, fourth, eighth ... round of weights, as long as each makes the violation of the
+true conditions smaller. A small part of the ellipsoid's law, of changes of the wrench, is added to the law of a Newton
+round. It vanishes where the rounds converge, and determines the forces between sliders that rest.
 
 If Lemke's method ends on a ray in a round of weights, there are contact forces that balance on every slider and do
 positive work on the motion of the pushers: the contacts jam.
@@ -28,21 +28,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax.contact.lemke import lemke
-from pushjax.contact.linear_patch import LinearPatch, mean_ellipsoid
+from pushjax.contact.linear_patch import LinearPatch
 from pushjax.contact.sliders_problem import LinearLaws, SlidersLCP, SlidersProblem
 from pushjax.contact.status import ContactMode, Status
 
-# Most problems take three to six rounds, and one or two from the motion of a similar problem.
-MAX_ROUNDS, MAX_ROUNDS_FROM_START = 40, 5
+MAX_ROUNDS = 100  # most problems take three to six
 # Keyed by the bytes of a float: the least weight of a slider, and the part of the ellipsoid's law in a Newton round, in
 # units of the largest weight.
 LEAST_WEIGHT, PROXIMAL = {4: 1e-3, 8: 1e-4}, {4: 1e-3, 8: 1e-5}
 RESTING_GAUGE = 0.9  # of a slider that counts as resting in a round of weights
 SAME_COVER, GOLDEN = 6, 0.6180339887  # rounds with the same covering vector, and what scatters it
+LEAST_DECREASE = 0.9  # of the violation from a Newton round to the next, for another one to follow
 MAX_FACTOR = 10.0  # of a weight, from a round to the next
-REFINEMENTS = 6  # Newton steps after the rounds, with the unknowns that may be positive in the best of them
-# Keyed by the bytes of a float: largest violation of a condition of a motion, and where the rounds end.
-TOLERANCE, NEARLY = {4: 1e-4, 8: 1e-9}, {4: 5e-4, 8: 1e-9}
+MAX_REFINEMENTS = 6  # Newton steps after the rounds, with the unknowns that may be positive in the best of them
+# Keyed by the bytes of a float: largest violation of a condition of a motion, where the rounds end, and Newton steps.
+TOLERANCE, NEARLY, ROUNDOFF = {4: 1e-4, 8: 1e-9}, {4: 5e-4, 8: 1e-9}, {4: 1e-6, 8: 1e-13}
 CERTIFICATE = {4: 1e-3, 8: 1e-6}  # largest wrench that is zero, and least power that is not, of forces of sum one
 
 
@@ -58,39 +58,42 @@ class SlidersMotion(NamedTuple):
     violation: Float[Array, " batch"]  # the largest of any condition, relative to the fastest motion and the forces
     basic: Bool[Array, "rows batch"]  # which unknowns of the LCP may be positive
     rounds: Int[Array, " batch"]
+    patch: LinearPatch  # the limit surfaces at the wrench
 
 
 class Start(NamedTuple):
     """Where the search for a motion may start: at that of a similar problem."""
 
     exists: Bool[Array, "*batch"]
+    force: Float[Array, "2 contacts *batch"]
     dissipation: Float[Array, "sliders *batch"]
-    wrench: Float[Array, "3 sliders *batch"]
+    basic: Bool[Array, "rows *batch"]
 
     @staticmethod
-    def none(problem: SlidersProblem) -> "Start":
-        """Nothing to start from."""
-        zero = jnp.zeros_like(problem.rows[0, :, :, 0])
-        return Start(jnp.zeros(zero.shape[2:], bool), zero[0], zero)
+    def none(contacts: int, dissipation: Float[Array, "sliders *batch"]) -> "Start":
+        """Nothing to start from, with the shape and dtype of what is given."""
+        zero = jnp.zeros_like(dissipation[0])
+        force, basic = (jnp.stack([zero] * rows) for rows in (2 * contacts, 3 * contacts + len(dissipation)))
+        force = force.reshape(2, contacts, *zero.shape)
+        return Start(zero > 0, force, jnp.zeros_like(dissipation), basic > 0)
 
 
 class _Round(NamedTuple):
     """What a round starts from."""
 
     is_newton: Bool[Array, " batch"]
-    is_first: Bool[Array, " batch"]  # whether no wrench is known yet
     weight: Float[Array, "sliders batch"]
     wrench: Float[Array, "3 sliders batch"]
+    patch: LinearPatch  # at the wrench
+    ellipsoid: Float[Array, "3 3 sliders batch"]  # of a round of weights
 
-    def laws(self, surface: Any, mean: Float[Array, "3 3 sliders batch"]) -> LinearLaws:
+    def laws(self, mean: Float[Array, "3 3 sliders batch"]) -> LinearLaws:
         """The laws of the sliders in this round."""
-        item, newton = self.weight.dtype.itemsize, self.is_newton[None, None]
-        patch = LinearPatch.at(surface, self.wrench)
+        item, newton, patch = self.weight.dtype.itemsize, self.is_newton[None, None], self.patch
         largest = jnp.max(self.weight, axis=0)[None]
         weight = jnp.maximum(self.weight, LEAST_WEIGHT[item] * largest)[None, None]
-        ellipsoid = jnp.where(self.is_first[None, None, None], mean, patch.ellipsoid())
-        own = weight * patch.curvature + PROXIMAL[item] * largest[None, None] * ellipsoid
-        law = jnp.where(newton[None], own, weight * ellipsoid)
+        own = weight * patch.curvature + PROXIMAL[item] * largest[None, None] * mean
+        law = jnp.where(newton[None], own, weight * self.ellipsoid)
         normal, origin = (jnp.where(newton, x, 0.0) for x in (patch.normal, self.wrench))
         return LinearLaws(law, normal, origin, jnp.sqrt(weight[0, 0]))
 
@@ -100,6 +103,7 @@ class _State(NamedTuple):
 
     next: _Round
     weights: _Round  # the next round of weights
+    weighted: Int[Array, " batch"]  # number of rounds of weights
     last_violation: Float[Array, " batch"]  # of the last Newton round, or infinity
     best: SlidersMotion
     ongoing: Bool[Array, " batch"]
@@ -111,60 +115,72 @@ def solve_sliders(
 ) -> SlidersMotion:
     """Find the motion of several sliders; it is not differentiated. All numbers are zero where they do not move.
 
-    If not `anew`, few rounds are tried, the first of them from `start`.
+    If not `anew`, only Newton steps are made, with the unknowns that may be positive at `start`.
     """
     problem, valid = problem.usable()
-    start = Start.none(problem) if start is None else start
-    pushes = jnp.any(problem.active & (problem.goal[0] > 0), axis=0)
-    force, none = jnp.zeros_like(problem.goal), jnp.zeros_like(pushes)
-    zero = problem.wrenches(force)
-    still = _motion(problem, force, zero[0], jnp.zeros((3 * problem.count + len(zero[0]), none.size), bool), 0)
-    unsolved = jnp.full_like(still.status, Status.NOT_CONVERGED)
-    first = _Round(none, ~none, jnp.ones_like(zero[0]), jnp.ones_like(zero))
-    guess = _Round(~none, none, start.dissipation + zero[0], start.wrench + zero)
-    guess = _where(start.exists & ~jnp.asarray(anew) & ~none, guess, first)
-    infinite = jnp.full_like(still.violation, jnp.inf)
-    best, mean = still._replace(violation=infinite, status=unsolved), mean_ellipsoid(problem.surface, zero)
-    most = jnp.where(anew, MAX_ROUNDS, MAX_ROUNDS_FROM_START)
-    last = jax.lax.while_loop(
-        lambda state: jnp.any(state.ongoing) & (state.number < most),
-        lambda state: _next_round(problem, mean, state),
-        _State(guess, first, infinite, best, pushes, jnp.zeros((), jnp.int32)),
-    ).best
-    refined = jax.lax.fori_loop(0, REFINEMENTS, lambda _, motion: _refined(problem, motion), last)
-    found = _where(refined.violation < last.violation, refined, last)
-    status = jnp.where(found.violation <= TOLERANCE[zero.dtype.itemsize], Status.MOVING, unsolved)
-    status = jnp.where(last.status == Status.JAMMED, Status.JAMMED, status)
+    pushes, anew = jnp.any(problem.active & (problem.goal[0] > 0), axis=0), jnp.asarray(anew)
+    if start is None:
+        start = Start.none(problem.count, jnp.zeros_like(problem.rows[0, 0, :, 0]))
+    start = Start(*(jnp.broadcast_to(x, (*x.shape[:-1], *pushes.shape)) for x in start))
+    before = _motion(problem, start.force, start.dissipation, start.basic, 0)
+    found = _where(anew & pushes, _in_rounds(problem, before, start.exists & pushes, pushes & anew), before)
+    is_jam = found.status == Status.JAMMED
+    found = _refined(problem, found, pushes & ~is_jam & (anew | start.exists))
+    unsolved = jnp.full_like(found.status, Status.NOT_CONVERGED)
+    status = jnp.where(found.violation <= TOLERANCE[found.force.dtype.itemsize], Status.MOVING, unsolved)
+    status = jnp.where(is_jam, Status.JAMMED, status)
     status = jnp.where(valid, jnp.where(pushes, status, Status.FREE), Status.INVALID).astype(jnp.int8)
-    found, still = (x._replace(status=status, violation=found.violation, rounds=last.rounds) for x in (found, still))
+    still = jax.tree.map(jnp.zeros_like, found)._replace(mode=jnp.full_like(found.mode, ContactMode.SEPARATED))
+    found, still = (x._replace(status=status, violation=found.violation, rounds=found.rounds) for x in (found, still))
     return _where(status == Status.MOVING, found, still)
+
+
+def _in_rounds(
+    problem: SlidersProblem, before: SlidersMotion, exists: Bool[Array, " batch"], wanted: Bool[Array, " batch"]
+) -> SlidersMotion:
+    """Solve LCPs in rounds, from a motion before where one exists: the best motion of all rounds."""
+    mean, infinite = problem.surface.mean_ellipsoid(before.wrench), jnp.full_like(before.violation, jnp.inf)
+    guess = _Round(exists, before.dissipation, before.wrench, before.patch, mean)
+    first = guess._replace(is_newton=exists & False, weight=jnp.ones_like(before.dissipation))
+    best = before._replace(violation=infinite, status=jnp.full_like(before.status, Status.NOT_CONVERGED))
+    none = jnp.zeros(exists.shape, jnp.int32)
+    start = _State(_where(exists, guess, first), first, none, infinite, best, wanted, jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(
+        lambda state: jnp.any(state.ongoing) & (state.number < MAX_ROUNDS),
+        lambda state: _next_round(problem, mean, state),
+        start,
+    ).best
 
 
 def _next_round(problem: SlidersProblem, mean: Float[Array, "3 3 sliders batch"], state: _State) -> _State:
     """Solve the LCP of a round, and decide what the next one starts from."""
     now = state.next
-    lcp = SlidersLCP.of(problem, now.laws(problem.surface, mean))
+    laws = now.laws(mean)
+    lcp = SlidersLCP.of(problem, laws)
     found, newton = lemke(lcp.matrix, lcp.q, _cover(state.number, lcp.q), state.ongoing), now.is_newton
     force = lcp.force(found.z) * lcp.force_unit[None]
-    wrench = problem.wrenches(force)
-    gauge = LinearPatch.at(problem.surface, wrench).gauge
-    by_gauge = lcp.speed_unit**2 * jnp.clip(gauge, 1 / MAX_FACTOR, MAX_FACTOR)
+    patch = LinearPatch.at(problem.surface, problem.wrenches(force))
+    by_gauge = lcp.speed_unit**2 * jnp.clip(patch.gauge, 1 / MAX_FACTOR, MAX_FACTOR)
     weight = jnp.where(newton[None], lcp.dissipation(found.z), by_gauge)
-    dissipation = jnp.where(newton[None] | (gauge >= RESTING_GAUGE), weight, 0.0)
+    dissipation = jnp.where(newton[None] | (patch.gauge >= RESTING_GAUGE), weight, 0.0)
     basic = jnp.concatenate([found.basic[: 3 * problem.count], dissipation > 0])
-    motion = _motion(problem, force, dissipation, basic, state.number + 1)
+    motion = _motion(problem, force, dissipation, basic, state.number + 1, patch)
     jams = ~newton & _is_certificate(problem, lcp.force(found.ray) * lcp.force_unit[None])
     motion = motion._replace(status=jnp.where(jams, Status.JAMMED, motion.status).astype(jnp.int8))
 
-    goes_on = ~newton | (found.solved & (motion.violation < state.last_violation / 2))
-    after = _Round(newton, now.is_first & ~found.solved, weight, wrench)
+    goes_on = ~newton | (found.solved & (motion.violation < LEAST_DECREASE * state.last_violation))
+    twist = jnp.sum(laws.law * motion.wrench[None], axis=1)  # of a round of weights
+    ellipsoid, by_twist = problem.surface.reweighted(twist, patch.ellipsoid(), weight)
+    after = _Round(newton, jnp.where(newton[None], weight, by_twist), motion.wrench, patch, ellipsoid)
     weights = _where(state.ongoing & found.solved & ~newton, after, state.weights)
-    next_round = _where(goes_on, after._replace(is_newton=jnp.ones_like(newton)), weights)
+    number = state.weighted + ~newton
+    tries_newton = newton | (number & (number - 1) == 0)
+    next_round = _where(goes_on, after._replace(is_newton=tries_newton), weights)
     violation = jnp.where(newton, motion.violation, jnp.inf)
     is_better = jams | (motion.violation < state.best.violation)
     ends = jams | (motion.violation <= NEARLY[force.dtype.itemsize])
     best = _where(state.ongoing & is_better, motion, state.best)
-    return _State(next_round, weights, violation, best, state.ongoing & ~ends, state.number + 1)
+    return _State(next_round, weights, number, violation, best, state.ongoing & ~ends, state.number + 1)
 
 
 def _cover(number: Int[Array, ""], q: Float[Array, "rows batch"]) -> Float[Array, "rows"]:
@@ -184,10 +200,11 @@ def _motion(
     dissipation: Float[Array, "sliders batch"],
     basic: Bool[Array, "rows batch"],
     rounds: int | Int[Array, ""],
+    patch: LinearPatch | None = None,
 ) -> SlidersMotion:
     """The motion under contact forces, given the dissipation of each slider, and how far it violates any condition."""
     wrench = problem.wrenches(force)
-    patch = LinearPatch.at(problem.surface, wrench)
+    patch = LinearPatch.at(problem.surface, wrench) if patch is None else patch
     twist = dissipation[None] * patch.normal
     speed, total = jnp.max(jnp.abs(twist), axis=(0, 1)), jnp.max(jnp.abs(force[0]), axis=0)
     normal, tangential = force / jnp.where(total > 0, total, 1.0)[None, None]
@@ -206,7 +223,7 @@ def _motion(
     mode = jnp.where(problem.active & (apart <= tolerance), mode, ContactMode.SEPARATED).astype(jnp.int8)
     status = jnp.full(violation.shape, Status.NOT_CONVERGED, jnp.int8)
     rounds = jnp.broadcast_to(jnp.asarray(rounds, jnp.int32), violation.shape)
-    return SlidersMotion(twist, wrench, force, dissipation, mode, status, violation, basic, rounds)
+    return SlidersMotion(twist, wrench, force, dissipation, mode, status, violation, basic, rounds, patch)
 
 
 def _is_certificate(problem: SlidersProblem, force: Float[Array, "2 contacts batch"]) -> Bool[Array, " batch"]:
@@ -218,12 +235,36 @@ def _is_certificate(problem: SlidersProblem, force: Float[Array, "2 contacts bat
     return (total > 0) & within & balanced & (jnp.sum(force * problem.goal, axis=(0, 1)) > least)
 
 
-def _refined(problem: SlidersProblem, motion: SlidersMotion) -> SlidersMotion:
-    """The motion after one more Newton step, with the same unknowns that may be positive."""
-    lcp, z = _at(problem, motion, PROXIMAL[problem.goal.dtype.itemsize])
-    z = z - _solve_basic(lcp, motion.basic, lcp.complements(z))
-    dissipation = jnp.maximum(lcp.dissipation(z), 0.0)
-    return _motion(problem, lcp.force(z) * lcp.force_unit[None], dissipation, motion.basic, 0)
+class _Refinement(NamedTuple):
+    """State between two Newton steps."""
+
+    last: SlidersMotion
+    best: SlidersMotion
+    ongoing: Bool[Array, " batch"]
+    number: Int[Array, ""]
+
+
+def _refined(problem: SlidersProblem, motion: SlidersMotion, wanted: Bool[Array, " batch"]) -> SlidersMotion:
+    """The best motion of Newton's method, with the same unknowns that may be positive."""
+    item = motion.force.dtype.itemsize
+
+    def newton_step(state: _Refinement) -> _Refinement:
+        lcp, z = _at(problem, state.last, PROXIMAL[item])
+        z = z - _solve_basic(lcp, motion.basic, lcp.complements(z, state.last.patch))
+        dissipation = jnp.maximum(lcp.dissipation(z), 0.0)
+        new = _motion(problem, lcp.force(z) * lcp.force_unit[None], dissipation, motion.basic, 0)
+        new = new._replace(rounds=motion.rounds)
+        is_better = state.ongoing & (new.violation < state.best.violation)
+        best = _where(is_better, new, state.best)
+        goes_on = (new.violation < state.last.violation / 2) | (best.violation > TOLERANCE[item])
+        ongoing = state.ongoing & goes_on & (new.violation > ROUNDOFF[item])
+        return _Refinement(new, best, ongoing, state.number + 1)
+
+    start = _Refinement(motion, motion, wanted & (motion.violation > ROUNDOFF[item]), jnp.zeros((), jnp.int32))
+    last = jax.lax.while_loop(
+        lambda state: jnp.any(state.ongoing) & (state.number < MAX_REFINEMENTS), newton_step, start
+    )
+    return last.best
 
 
 def differentiable_motion(problem: SlidersProblem, motion: SlidersMotion) -> SlidersMotion:
@@ -260,7 +301,12 @@ def _root_jvp(primals, tangents):
     )
     # with as little of the ellipsoid's law for sliders that rest as roundoff allows
     proximal = float(jnp.finfo(z.dtype).eps) ** 0.5
-    _, change = eqx.filter_jvp(lambda problem: _at(problem, motion, 0.0)[0].complements(z), (problem,), (changes,))
+
+    def complements(problem: SlidersProblem) -> Float[Array, "rows batch"]:
+        lcp = _at(problem, motion, 0.0)[0]
+        return lcp.complements(z, LinearPatch.at(problem.surface, lcp.problem.wrenches(lcp.force(z))))
+
+    _, change = eqx.filter_jvp(complements, (problem,), (changes,))
     lcp, _ = _at(problem, motion, proximal)
     return _root(problem, motion, z), -_solve_basic(lcp, motion.basic, change)
 
@@ -270,7 +316,7 @@ def _at(
 ) -> tuple[SlidersLCP, Float[Array, "rows batch"]]:
     """The LCP of a Newton round at a motion, and its unknowns there."""
     # the small part of the ellipsoid's law is only for sliders that rest
-    patch, largest = LinearPatch.at(problem.surface, motion.wrench), jnp.max(motion.dissipation, axis=0)[None]
+    patch, largest = motion.patch, jnp.max(motion.dissipation, axis=0)[None]
     weight = jnp.where(motion.dissipation > 0, motion.dissipation, jnp.where(largest > 0, largest, 1.0))
     resting = proximal * weight[None, None] * patch.ellipsoid()
     law = jnp.where((motion.dissipation > 0)[None, None], weight[None, None] * patch.curvature, resting)

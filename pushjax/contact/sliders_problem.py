@@ -18,14 +18,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax.contact.linear_patch import LinearPatch
-from pushjax.friction.polynomial import Polynomial
+from pushjax.contact.linear_patch import LinearPatch, Surface
 
 
 class SlidersProblem(NamedTuple):
     """Contacts of several sliders with each other and with pushers, in dimensionless numbers."""
 
-    surface: Polynomial  # H of the normalized wrench, of each slider; its table has axes for sliders and batch
+    surface: Surface  # by the normalized wrench
     # motion (n, t) of the first body of a contact relative to the second, by the normalized twist of each slider
     rows: Float[Array, "2 3 sliders contacts batch"]
     goal: Float[Array, "2 contacts batch"]  # the motion that keeps the bodies in contact, at most of order one
@@ -49,11 +48,10 @@ class SlidersProblem(NamedTuple):
         """The problem without numbers that cannot be computed with, all of one batch, and whether there were none."""
         size = jnp.broadcast_shapes(*(leaf.shape[-1:] for leaf in jax.tree.leaves(self)))
         self = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], *size)), self)
-        finite = jnp.all(jnp.isfinite(self.surface.table), axis=(0, 1, 2, 3))
+        surface, finite = self.surface.usable()
         own = jnp.isfinite(jnp.sum(self.rows, axis=(0, 1, 2)) + jnp.sum(self.goal, axis=0) + self.friction)
         valid = finite & jnp.all((own & (self.friction >= 0)) | ~self.active, axis=0)
         active = self.active & valid[None]
-        surface = Polynomial(jnp.where(valid[None, None, None, None], self.surface.table, 1.0))
         rows, goal = (jnp.where(jnp.expand_dims(active, tuple(range(x.ndim - 2))), x, 0.0) for x in self[1:3])
         return SlidersProblem(surface, rows, goal, jnp.where(active, self.friction, 0.0), active), valid
 
@@ -137,10 +135,9 @@ class SlidersLCP(NamedTuple):
         right = tangential + self.problem.friction * normal
         return jnp.concatenate([normal, right, left, dissipation / self.speed_unit])
 
-    def complements(self, z: Float[Array, "rows batch"]) -> Float[Array, "rows batch"]:
-        """What is complementary to the unknowns by the true limit surfaces, where w is by the linear laws."""
+    def complements(self, z: Float[Array, "rows batch"], patch: LinearPatch) -> Float[Array, "rows batch"]:
+        """What is complementary to the unknowns by the true limit surfaces at their wrench, where w is by the laws."""
         problem, force = self.problem, self.force(z)
-        patch = LinearPatch.at(problem.surface, problem.wrenches(force))
         slip = problem.slips(self.dissipation(z)[None] * patch.normal)
         left = z[2 * problem.count : 3 * problem.count]
         rest = problem.friction * force[0] - force[1]

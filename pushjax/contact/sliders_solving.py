@@ -18,11 +18,14 @@ from pushjax._internal.trailing_batch import with_batch_last
 from pushjax._internal.xla import tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
+from pushjax.contact.linear_patch import MixedSurfaces, Surface
 from pushjax.contact.several_sliders import SlidersMotion, Start, differentiable_motion, solve_sliders
 from pushjax.contact.sliders_problem import SlidersProblem
 from pushjax.contact.status import Status
+from pushjax.friction.feet import FeetForm
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.polynomial import Polynomial
+from pushjax.friction.support_points import SupportPoints
 
 
 class Touching(NamedTuple):
@@ -51,12 +54,12 @@ class SlidersSolution(NamedTuple):
 def solve_touching(forms: tuple[Form, ...], touching: Touching, guess: Start | None) -> SlidersSolution:
     """Find the motion of several sliders."""
     problem, displacement_unit, force_unit = _scaled(forms, touching)
-    guess = Start.none(problem) if guess is None else guess
+    guess = Start.none(problem.count, problem.rows[0, 0, :, 0]) if guess is None else guess
     motion = _solve(problem, guess)
     ones = jnp.ones_like(displacement_unit)
     units = jnp.stack([jnp.stack([ones, ones, 1 / form.length]) for form in forms], axis=1) * displacement_unit
     moves = motion.status == Status.MOVING
-    found = Start(moves, motion.dissipation, motion.wrench)
+    found = Start(moves, motion.force, motion.dissipation, motion.basic)
     return SlidersSolution(
         Vec3.of(motion.twist * units),
         Vec3.of(motion.wrench * force_unit),
@@ -72,12 +75,7 @@ def solve_touching(forms: tuple[Form, ...], touching: Touching, guess: Start | N
 def _scaled(forms: tuple[Form, ...], touching: Touching) -> tuple[SlidersProblem, Scalar, Scalar]:
     """The dimensionless problem, and the units of displacement and force, which are constants to every derivative."""
     contact, active = touching.contact, touching.active
-    surfaces = [Polynomial.of(form.table()) for form in forms]
-    if any(surface.degree == 4 for surface in surfaces):
-        surfaces = [surface if surface.degree == 4 else surface.squared() for surface in surfaces]
-    surface = Polynomial(jnp.stack([surface.table for surface in surfaces], axis=-1))
-    force_unit = jax.lax.stop_gradient(1 / surface.root(jnp.min(surface.scale())))
-    surface = Polynomial(surface.table * force_unit**surface.degree)
+    surface, force_unit = _surface(forms)
 
     size = jnp.maximum(jnp.maximum(jnp.abs(contact.displacement.x), jnp.abs(contact.displacement.y)), -contact.gap)
     unit = jax.lax.stop_gradient(jnp.max(jnp.where(active & jnp.isfinite(size), size, 0.0)))
@@ -94,6 +92,36 @@ def _scaled(forms: tuple[Form, ...], touching: Touching) -> tuple[SlidersProblem
             own += jnp.where(takes_part[None, None], sign * of_side * scale[None, :, None], 0.0)
         rows.append(own)
     return SlidersProblem(surface, jnp.stack(rows, axis=2), goal, contact.friction, active), unit, force_unit
+
+
+def _surface(forms: tuple[Form, ...]) -> tuple[Surface, Scalar]:
+    """The limit surfaces of all sliders in a unit of force in which none is large, and that unit, N."""
+    is_exact = [isinstance(form, FeetForm) for form in forms]
+    # of each kind, a slider of the other kind has any surface
+    eye = jnp.eye(3, dtype=forms[0].length.dtype)
+    sphere, two_points = Polynomial(2 * eye[:, :, None]), SupportPoints(eye[:2, :2], eye[0, :1].repeat(2))
+    polynomials = [sphere if isinstance(form, FeetForm) else Polynomial.of(form.table()) for form in forms]
+    if any(polynomial.degree == 4 for polynomial in polynomials):
+        polynomials = [each if each.degree == 4 else each.squared() for each in polynomials]
+    points = [form.points if isinstance(form, FeetForm) else two_points for form in forms]
+    most = max(len(each.limit) for each in points)
+    points = [
+        jax.tree.map(lambda leaf: jnp.pad(leaf, (*[(0, 0)] * (leaf.ndim - 1), (0, most - leaf.shape[-1]))), each)
+        for each in points
+    ]
+    units = [
+        jnp.sum(support.limit) if exact else 1 / polynomial.root(polynomial.scale())
+        for exact, support, polynomial in zip(is_exact, points, polynomials, strict=True)
+    ]
+    unit = jax.lax.stop_gradient(jnp.max(jnp.stack(units)))
+    polynomial, support = (
+        jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=-1), *each) for each in (polynomials, points)
+    )
+    polynomial = Polynomial(polynomial.table * unit**polynomial.degree)
+    support = support._replace(limit=support.limit / unit)
+    if not any(is_exact):
+        return polynomial, unit
+    return support if all(is_exact) else MixedSurfaces(polynomial, support, jnp.asarray(is_exact)), unit
 
 
 def _rows(point: Vec2, normal: Vec2) -> Float[Array, "2 3 contacts"]:

@@ -1,8 +1,9 @@
 """The interface that limit surfaces of all degrees share: `LimitSurface`, and its `Form` for inner loops.
 
-A limit surface is the level set H(F) = 1 of a convex polynomial H. H is homogeneous of even degree d in the normalized
-wrench F = (fx, fy, tau / length). While the slider slides, its normalized twist (vx, vy, length * omega) is a positive
-multiple of grad H(F). The code uses Euler's identities throughout: F . grad H = d H and hess H F = (d - 1) grad H.
+A limit surface is the level set H(F) = 1 of a convex H that is homogeneous of degree d in the normalized wrench
+F = (fx, fy, tau / length). H is a polynomial of even degree, or for an exact limit surface (`Feet`) its gauge, of
+degree one. While the slider slides, its normalized twist (vx, vy, length * omega) is a positive multiple of grad H(F).
+The code uses Euler's identities throughout: F . grad H = d H and hess H F = (d - 1) grad H.
 
 Reference: Zhou et al. 2016; Zhou et al. 2017, section III.A.
 """
@@ -28,7 +29,7 @@ from pushjax.friction.polynomial import Polynomial
 
 # Kinds of surfaces in files. Their modules are named like them. They are imported when needed, because a user who loads
 # a surface may not have imported them.
-KINDS = ("ellipsoid", "quartic")
+KINDS = ("ellipsoid", "quartic", "feet")
 MAX_LENGTH = 1e8  # of a traced surface, m; its fourth power is still a number, and so is that of the inverse
 # Keyed by the bytes of a float: largest factor of H, whose square is still a number; and roundoff of least minors.
 MAX_SCALE, CONVEX_ROUNDOFF = {4: 1e16, 8: 1e120}, {4: 1e-5, 8: 1e-13}
@@ -120,6 +121,18 @@ class LimitSurface(eqx.Module):
     def _aligned_wrench(self, v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
         """Return a normalized wrench of any scale whose twist is `v`, of norm one, and the number of Newton rounds."""
 
+    def _wrench_of(self, v: Vec3) -> tuple[Vec3, Bool[Array, ""], Int[Array, ""], Scalar]:
+        """Return the normalized wrench on H = 1 whose twist is along `v`, and the other fields of `InverseMap`."""
+        form = self.form()
+        f, rounds = self._aligned_wrench(v)
+        h = form.value(f)
+        angle = angle_between(form.gradient(f), v)
+        # some 1e-3 rad in float32 and 1e-12 rad in float64
+        converged = (h > 0) & (angle <= 1e4 * float(jnp.finfo(angle.dtype).eps))
+        positive = jnp.where(converged, h, 1.0)
+        scale = jnp.where(converged, 1 / jnp.sqrt(positive) if self.degree == 2 else positive**-0.25, 0.0)
+        return f.scale(scale), converged, rounds, angle
+
     def inverse(self, twist: ArrayLike) -> InverseMap:
         """Find the wrench on H = 1 whose twist has the direction of `twist`.
 
@@ -146,15 +159,9 @@ class LimitSurface(eqx.Module):
             usable, normalized / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], normalized.dtype)
         )
         v = Vec3.of(normalized / jnp.sqrt(jnp.sum(normalized * normalized)))
-        form = self.form()
-        f, rounds = self._aligned_wrench(v)
-        h = form.value(f)
-        angle = angle_between(form.gradient(f), v)
-        # some 1e-3 rad in float32 and 1e-12 rad in float64
-        converged = usable & (h > 0) & (angle <= 1e4 * float(jnp.finfo(angle.dtype).eps))
-        positive = jnp.where(converged, h, 1.0)
-        scale = jnp.where(converged, 1 / jnp.sqrt(positive) if self.degree == 2 else positive**-0.25, 0.0)
-        wrench = jnp.where(converged, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
+        f, found, rounds, angle = self._wrench_of(v)
+        converged = usable & found
+        wrench = jnp.where(converged, jnp.stack([f.x, f.y, f.z * self.length]), 0.0)
         return InverseMap(wrench, converged, rounds, angle)
 
     def _normalized_wrench(self, wrench: ArrayLike) -> Vec3:

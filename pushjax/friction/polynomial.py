@@ -7,10 +7,14 @@ follow from it by Euler's identities. Of a quadratic H the Hessian is constant, 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from pushjax._math.arrays import ENTRIES, FULL, dot
 from pushjax._math.sums import repeated, summed
+
+# Directions of wrenches: along the axes and the diagonals.
+DIRECTIONS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, 1], [1, 1, -1], [1, -1, -1]])
 
 
 class Polynomial(NamedTuple):
@@ -69,6 +73,30 @@ class Polynomial(NamedTuple):
     def root(self, h: Float[Array, "*rest"]) -> Float[Array, "*rest"]:
         """h^(1/d) for h > 0: the factor by which a wrench with H = h exceeds H = 1."""
         return jnp.sqrt(h) if self.degree == 2 else jnp.sqrt(jnp.sqrt(h))
+
+    def patch(
+        self, wrench: Float[Array, "3 *rest"]
+    ) -> tuple[Float[Array, "*rest"], Float[Array, "3 *rest"], Float[Array, "3 3 *rest"]]:
+        """The gauge gamma(F) = H(F)^(1/d) of wrenches other than zero, its gradient, and its Hessian at gamma = 1."""
+        degree, gauge = self.degree, self.root(self.value(wrench))
+        unit = wrench / gauge[None]
+        normal = self.gradient(unit) / degree
+        return gauge, normal, self.hessian(unit) / degree - (degree - 1) * normal[:, None] * normal[None]
+
+    def mean_ellipsoid(self, wrench: Float[Array, "3 *batch"]) -> Float[Array, "3 3 *batch"]:
+        """The mean matrix of ellipsoids that agree with the limit surface at some wrenches, shaped as those given."""
+        directions = jnp.asarray(DIRECTIONS.T, wrench.dtype).reshape(3, -1, *(1,) * (wrench.ndim - 1))
+        _, normal, curvature = self.patch(jnp.broadcast_to(directions, (*directions.shape[:2], *wrench.shape[1:])))
+        return jnp.mean(curvature + normal[:, None] * normal[None], axis=2)
+
+    def reweighted(self, twist: Array, ellipsoid: Array, weight: Array) -> tuple[Array, Array]:
+        """As given: `SupportPoints` have a law of their own for a twist."""
+        return ellipsoid, weight
+
+    def usable(self) -> tuple["Polynomial", Bool[Array, " batch"]]:
+        """H without numbers that cannot be computed with, all of one batch, and whether there were none."""
+        finite = jnp.all(jnp.isfinite(self.table), axis=tuple(range(self.table.ndim - 1)))
+        return Polynomial(jnp.where(jnp.broadcast_to(finite, self.table.shape), self.table, 1.0)), finite
 
 
 def _pairs(f: Float[Array, "3 *rest"]) -> Float[Array, "6 *rest"]:

@@ -7,6 +7,7 @@ If no motion satisfies every contact, the hand has jammed, and it stops there fo
 changes nothing.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 
@@ -22,6 +23,7 @@ from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
+from pushjax.friction.feet import Feet
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.table import Table, TransformedForm
 from pushjax.geometry.shape import Shape
@@ -99,9 +101,7 @@ def step(
 
 @quick_jit
 def _step(slider, hand, q0, q1, pose, friction, solver, table, fixtures) -> Step:
-    uniform = form_and_friction(slider.surface, friction)
-    friction_at = friction_on_table(table, lambda step, pose: uniform)
-    push = simulate(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, friction_at, fixtures)
+    push = _simulate_one(slider, hand, jnp.stack([q0, q1]), pose, friction, solver, table, fixtures)
     fields = {name: getattr(push, name)[-1] for name in Step.__dataclass_fields__}
     return Step(**fields)
 
@@ -187,6 +187,16 @@ def rollout(
 def _rollout(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
     if isinstance(slider, tuple):
         return simulate_sliders(slider, hand, path, pose, friction[0], friction[1], fixtures, num_steps)
+    return _simulate_one(slider, hand, path, pose, friction, solver, table, fixtures, num_steps)
+
+
+def _simulate_one(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
+    """Roll out a path of one slider, by the solver for several if its limit surface is no polynomial."""
+    if isinstance(slider.surface, Feet) and solver is None and table is None:
+        alone = jnp.zeros((1, 1), pose.dtype)
+        push = simulate_sliders((slider,), hand, path, pose[None], friction, alone, fixtures, num_steps)
+        of_slider = {name: getattr(push, name)[:, 0] for name in ("pose", "twist", "wrench")}
+        return dataclasses.replace(push, **of_slider)
     uniform = form_and_friction(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
     return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures, num_steps)

@@ -21,7 +21,14 @@ from pushjax.simulation.hand import Finger, Hand, Pad, RoundFinger
 from pushjax.simulation.prepared_push import prepared_push
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
-from pushjax.simulation.sliders_step import Body, can_push, compute_sliders_step, depth_of_sliders, meetings_of
+from pushjax.simulation.sliders_step import (
+    Body,
+    can_push,
+    compute_sliders_step,
+    contact_counts,
+    depth_of_sliders,
+    meetings_of,
+)
 from pushjax.simulation.step import StepRecord
 from pushjax.simulation.substeps import (
     BRACING,
@@ -57,9 +64,8 @@ class PreparedSliders(NamedTuple):
         motions = self.motions_at(first, self.friction_at(first))
         meetings = meetings_of(self.bodies, motions, self.fixtures)
         overlap = depth_of_sliders(self.bodies, meetings, pose, 0.0)
-        count = len(self.bodies)
-        none = jnp.zeros((3, count), overlap.dtype)
-        return first_state(pose, overlap, Start(jnp.zeros((), bool), none[0], none))
+        contacts = sum(contact_counts(self.bodies, meetings))
+        return first_state(pose, overlap, Start.none(contacts, jnp.zeros_like(overlap + pose.x)))
 
     def trial(self, state: PushState, number: Int[Array, ""]) -> tuple[PushState, tuple[StepRecord, StepEnd]]:
         """Try the next part of a step: the state after it, the record of the part, and how the step ended."""

@@ -8,6 +8,7 @@ from jaxtyping import Array
 from pushjax._internal.checks import ArrayLike, check_type
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
+from pushjax.friction.feet import Feet
 from pushjax.friction.fit import fit_limit_surface
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.support import Support
@@ -59,21 +60,26 @@ class Slider(eqx.Module):
         return Slider.on(shape, Support.uniform(shape, load=load), degree=degree)
 
     @staticmethod
-    def on(shape: Shape, support: Support, *, degree: int = 4) -> "Slider":
+    def on(shape: Shape, support: Support, *, degree: int = 4, exact: bool = False) -> "Slider":
         """Slider with a known distribution of pressure.
 
         Args:
             shape: Outline, in the body frame.
             support: Pressure under the slider, in the same frame.
             degree: Degree of the limit surface, 2 (an ellipsoid) or 4.
+            exact: Whether to take the exact limit surface of the support in place of a polynomial; `rollout` and `step`
+                take it.
 
         Returns:
-            The slider. Its limit surface is fitted to 400 wrench-twist pairs of the support, sampled with the key 0, so
-            the same arguments give the same bits.
+            The slider. Its limit surface is exact (`Feet`), or fitted to 400 wrench-twist pairs of the support, sampled
+            with the key 0, so the same arguments give the same bits.
 
         Raises:
-            ValueError: As in `Support.wrench_twist_pairs` and `fit_limit_surface`.
+            ValueError: As in `Support.wrench_twist_pairs` and `fit_limit_surface`; for an exact surface, if all loads
+                are on one point.
         """
+        if exact:
+            return Slider(shape, Feet(support.point, support.limit))
         pairs = support.wrench_twist_pairs(jax.random.key(0), FIT_PAIRS)
         return Slider(shape, fit_limit_surface(*pairs, degree=degree))
 

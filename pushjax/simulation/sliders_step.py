@@ -104,6 +104,12 @@ def meetings_of(
     return meetings
 
 
+def contact_counts(bodies: tuple[Body, ...], meetings: list[Meeting]) -> list[int]:
+    """Return the number of contacts of each meeting."""
+    frames = tuple(BodyFrame.at(Vec3(*(jnp.zeros_like(body.center.x),) * 3)) for body in bodies)
+    return [num_contacts(m.found_at(frames, bodies).finger, bodies[m.slider].outline) for m in meetings]
+
+
 def depth_of_sliders(bodies: tuple[Body, ...], meetings: list[Meeting], pose: Vec3, fraction: float) -> Scalar:
     """Return the depth of the deepest finger, fixture or slider in a slider after `fraction` of the step, m."""
     poses = tuple(Vec3(pose.x[i], pose.y[i], pose.z[i]) for i in range(len(bodies)))
@@ -207,7 +213,7 @@ def compute_sliders_step(
     parts = [PushingPart(body.outline, form.length, start, begin, 1 - begin, reach) for body, start, form in each]
     found = [m.found_at(starts, bodies) for m in meetings]
     features = [parts[m.slider].features_of(body) for m, body in zip(meetings, found, strict=True)]
-    sizes = [num_contacts(body.finger, bodies[m.slider].outline) for m, body in zip(meetings, found, strict=True)]
+    sizes = contact_counts(bodies, meetings)
     part = _PushingPart(forms, bodies, meetings, starts, parts, features, sizes, len(motions), ongoing)
     before = _before(starts, sizes, guess, overlap_before)
     last, _ = jax.lax.scan(part.stage, before, jnp.array([0.0, 0.5], overlap_before.dtype))
