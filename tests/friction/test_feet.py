@@ -82,6 +82,7 @@ def test_surface_of_feet():
         np.testing.assert_allclose(found / np.linalg.norm(found), twist / np.linalg.norm(twist), atol=1e-7)
 
 
+@SLOW
 def test_derivatives_are_those_of_differences():
     point, limit, wrench = (jnp.asarray(x[..., 0]) for x in random_feet(4, 8))
     # one wrench where all slide, and one on the facet of the first point
@@ -107,6 +108,7 @@ def test_derivatives_are_those_of_differences():
             np.testing.assert_allclose(jax.jacrev(found)(jnp.zeros(())), forward, rtol=1e-6, atol=1e-8)
 
 
+@SLOW
 @pytest.mark.parametrize("sticks", [True, False])
 def test_contact_moves_with_least_dissipation(sticks):
     # a contact that sticks, or one without friction, does no work of its own
@@ -153,6 +155,7 @@ def test_push_through_the_center_of_pressure_does_not_turn():
     np.testing.assert_allclose(push.pose[-1], [0.05, 0.0, 0.0], atol=1e-9)
 
 
+@SLOW
 def test_slider_pivots_about_a_heavy_foot():
     support = pj.Support.points([[-0.02, 0.0], [0.03, 0.01], [0.02, -0.02]], [8.0, 1.0, 1.0])
     slider = Slider.on(BOX, support, exact=True)
@@ -169,6 +172,10 @@ def test_slider_pivots_about_a_heavy_foot():
 def test_one_point_alone_is_refused():
     with pytest.raises(ValueError, match="all loads are on one point"):
         Slider.on(BOX, pj.Support.points([[0.0, 0.0], [0.1, 0.0]], [1.0, 0.0]), exact=True)
+
+
+@SLOW
+def test_one_point_alone_that_is_traced_is_invalid():
     status = jax.jit(lambda x: push_of(Feet(jnp.stack([jnp.zeros(2), x]), jnp.ones(2))).status)(jnp.zeros(2))
     assert set(np.asarray(status).tolist()) == {int(pj.Status.INVALID)}
 

@@ -189,3 +189,19 @@ def test_bad_arguments():
         pj.rollout(DISK, FINGER, path, pose=poses[0], friction=0.2, between=0.1)
     with pytest.raises(TypeError, match="slider"):
         pj.rollout((DISK, SURFACE), FINGER, path, pose=poses, friction=0.2, between=0.1)
+
+
+@pytest.mark.slow
+def test_exact_and_fitted_surfaces_push_each_other():
+    support = pj.Support.tripod([[-0.02, -0.012], [0.02, -0.012], [0.0, 0.02]])
+    box = pj.Polygon.rectangle(0.06, 0.04)
+    sliders = pj.Slider.on(box, support, exact=True), pj.Slider.uniform(pj.Disk(0.02))
+    start = np.array([[0.0, 0.0, 0.0], [0.055, 0.004, 0.0]])
+    path = pj.line((-0.036, 0.004), (0.0, 0.004), steps=32)
+    push = pj.rollout(sliders, pj.Hand.finger(0.005), path, pose=start, friction=0.3, between=0.2)
+    assert not np.any(push.failed)
+    assert np.linalg.norm(push.pose[-1, 1, :2] - start[1, :2]) > 0.02
+    # a wrench inside the exact limit surface moves nothing, and one that moves the slider is on it
+    wrench, moves = np.asarray(push.wrench[:, 0]), np.any(np.asarray(push.twist[:, 0]) != 0, axis=1)
+    value = np.array([sliders[0].surface.value(each) for each in wrench])
+    np.testing.assert_allclose(value[moves], 1.0, rtol=1e-8)
