@@ -1,7 +1,7 @@
 """The motion of several sliders of one example, in physical units: batched by `vmap`, and differentiable.
 
-In a batch, the guess is tried first: some Newton rounds from the wrenches of the stage before. Those examples that it
-does not solve start anew (`in_tiles`).
+The guess is tried first: Newton steps with the unknowns that could be positive in the stage before. Where that fails,
+LCPs are solved in rounds (`several_sliders`); in a batch, these examples follow the others (`in_tiles`).
 """
 
 from functools import partial
