@@ -65,7 +65,7 @@ class LinearPatch(NamedTuple):
     curvature: Float[Array, "3 3 *rest sliders batch"]  # C
 
     @staticmethod
-    def at(surface: "Surface", wrench: Float[Array, "3 *rest sliders batch"]) -> "LinearPatch":
+    def at(surface: Surface, wrench: Float[Array, "3 *rest sliders batch"]) -> "LinearPatch":
         """The limit surface at a wrench; for a zero wrench, at another one, with a gauge of zero."""
         size = jnp.max(jnp.abs(wrench), axis=0)
         acts = size > jnp.finfo(size.dtype).tiny ** 0.2  # of a smaller one, H may be zero

@@ -81,7 +81,7 @@ class InverseMap(NamedTuple):
 
 
 class LimitSurface(eqx.Module):
-    """A limit surface: the boundary H = 1, for a convex polynomial H, of the wrenches that friction can resist.
+    """A limit surface: the boundary H = 1, for a convex H, of the wrenches that friction can resist.
 
     Attributes:
         length: Characteristic length that normalizes torques and angular velocities, m.

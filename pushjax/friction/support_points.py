@@ -37,7 +37,7 @@ class SupportPoints(NamedTuple):
     def are_valid(self) -> Bool[Array, "*batch"]:
         """Whether the limit surface has an inside: whether loads are on two points at least."""
         size = jnp.max(jnp.where(self.limit > 0, jnp.max(jnp.abs(self.point), axis=0), 0.0), axis=0)
-        stiffness = _summed_over_points(self.point, self.limit, jnp.zeros_like(self.limit), self.limit)
+        stiffness = _viscous(self.point, self.limit)
         total, torque = stiffness[0, 0], stiffness[2, 2]
         spread = torque - (stiffness[0, 2] ** 2 + stiffness[1, 2] ** 2) / jnp.where(total > 0, total, 1.0)
         known = jnp.isfinite(jnp.sum(self.point, axis=(0, 1)) + total) & jnp.all(self.limit >= 0, axis=0)
@@ -46,9 +46,9 @@ class SupportPoints(NamedTuple):
     def mean_ellipsoid(self, wrench: Float[Array, "3 *batch"]) -> Float[Array, "3 3 *batch"]:
         """The matrix of the ellipsoid of points that would resist in proportion to their velocity."""
         total = jnp.sum(self.limit, axis=0)
-        stiffness = _summed_over_points(self.point, self.limit, jnp.zeros_like(self.limit), self.limit)
+        stiffness = _viscous(self.point, self.limit)
         stiffness = jnp.broadcast_to(stiffness * total[None, None], (3, *wrench.shape))
-        return jnp.stack([_solve(stiffness, column) for column in _eye(wrench)])
+        return _inverse(stiffness)
 
     def reweighted(self, twist: Array, ellipsoid: Array, weight: Array) -> tuple[Array, Array]:
         """The ellipsoid B and the weight s of the law V = s B F of a twist; as given for a zero twist.
@@ -56,14 +56,12 @@ class SupportPoints(NamedTuple):
         Its points resist in proportion to their velocity, each with the factor that it has at the twist.
         """
         points, total = self._points(twist)
-        origin = points.slowest(twist)
-        local, twist = points.about(origin), _at_frame(twist, -origin)
-        power = local.power(twist, 0.0)
+        origin, local, twist, power = points.about_slowest(twist)
         moves = power > 0
         velocity = local.velocity(twist / jnp.where(moves, power, 1.0)[None])
         factor = local.limit / _speeds(velocity, SLOW[twist.dtype.itemsize])
-        stiffness = _summed_over_points(local.point, factor, jnp.zeros_like(factor), factor) * (total**2)[None, None]
-        own = _turned_to(origin, jnp.stack([_solve(stiffness, column) for column in _eye(twist)]))
+        stiffness = _viscous(local.point, factor) * (total**2)[None, None]
+        own = _turned_to(origin, _inverse(stiffness))
         return jnp.where(moves[None, None], own, ellipsoid), jnp.where(moves, total * power, weight)
 
     def usable(self) -> tuple["SupportPoints", Bool[Array, " batch"]]:
@@ -98,7 +96,7 @@ class SupportPoints(NamedTuple):
         # F F' has the same dV, and dV = V for dF = F. K falls in proportion to V.
         matrix = total[None, None] * stiffness * power[None, None]
         unit = jax.lax.stop_gradient(points.wrench / (scale * gauge)[None])
-        inverse = jnp.stack([_solve(matrix + unit[:, None] * unit[None], column) for column in _eye(wrench)])
+        inverse = _inverse(matrix + unit[:, None] * unit[None])
         inverse, normal = _turned_to(origin, inverse), _at_frame(normal, origin)
         curvature = jax.lax.stop_gradient(inverse - normal[:, None] * normal[None])
         return gauge, normal, curvature
@@ -138,10 +136,12 @@ class _Points(NamedTuple):
         """D of a twist."""
         return jnp.sum(self.limit * _speeds(self.velocity(twist), still), axis=0)
 
-    def slowest(self, twist: Float[Array, "3 *rest"]) -> Float[Array, "2 *rest"]:
-        """The point that moves least, of those that bear a load."""
+    def about_slowest(self, twist: Float[Array, "3 *rest"]) -> tuple[Array, "_Points", Array, Array]:
+        """The point with a load that moves least, everything about that point, the twist too, and D of the twist."""
         speed = jnp.where(self.limit > 0, _speeds(self.velocity(twist), 0.0), jnp.inf)
-        return jnp.take_along_axis(self.point, jnp.argmin(speed, axis=0)[None, None], 1)[:, 0]
+        origin = jnp.take_along_axis(self.point, jnp.argmin(speed, axis=0)[None, None], 1)[:, 0]
+        local, twist = self.about(origin), _at_frame(twist, -origin)
+        return origin, local, twist, local.power(twist, 0.0)
 
     def stiffness(self, velocity: Array, force: Array, still: Array | float) -> Float[Array, "3 3 *rest"]:
         """The derivative of the total force by the twist, given forces in units of their limits."""
@@ -158,8 +158,8 @@ class _Points(NamedTuple):
         total = jnp.stack([*jnp.sum(force, axis=1), jnp.sum(x * fy - y * fx, axis=0)])
         # D does not curve along V, and F . V does not change
         wrench = self.wrench
-        matrix = stiffness + jax.lax.stop_gradient(wrench[:, None] * wrench[None])
-        by_wrench, by_force = _solve(matrix, wrench), _solve(matrix, total)
+        inverse = _inverse(stiffness + jax.lax.stop_gradient(wrench[:, None] * wrench[None]))
+        by_wrench, by_force = combined(inverse, wrench), combined(inverse, total)
         missing = 1 - dot(wrench, twist) + dot(wrench, by_force)
         return by_wrench * (missing / dot(wrench, by_wrench))[None] - by_force
 
@@ -177,15 +177,13 @@ class _Search(NamedTuple):
 def _search(points: _Points) -> tuple[Float[Array, "2 *rest"], Float[Array, "3 *rest"], Float[Array, "*rest"]]:
     """Find the largest F . V / D(V): the slowest point, V about that point with D(V) = 1, and 1 / (F . V)."""
     least, limit = STANDS_STILL[points.wrench.dtype.itemsize], points.limit
-    first = _solve(_summed_over_points(points.point, limit, jnp.zeros_like(limit), limit), points.wrench)
+    first = combined(_inverse(_viscous(points.point, limit)), points.wrench)
     lengths = jnp.asarray(LENGTHS, limit.dtype).reshape(-1, *(1,) * limit.ndim)
 
     def step(state: _Search) -> _Search:
         twist, force, still, _, number = state
-        origin = points.slowest(twist)
-        local, twist = points.about(origin), _at_frame(twist, -origin)
+        origin, local, twist, power = points.about_slowest(twist)
         # in units of mean speeds
-        power = local.power(twist, 0.0)
         local, twist = local.scaled(_ratio(power, dot(local.wrench, twist))), twist / power[None]
         velocity = local.velocity(twist)
         speed = _speeds(velocity, still)
@@ -205,9 +203,7 @@ def _search(points: _Points) -> tuple[Float[Array, "2 *rest"], Float[Array, "3 *
     still = jnp.full_like(first[0], RATE)
     start = _Search(first, force, still, still > 0, jnp.zeros((), jnp.int32))
     last = jax.lax.while_loop(lambda state: jnp.any(state.ongoing) & (state.number < MAX_STEPS), step, start)
-    origin = points.slowest(last.twist)
-    local, twist = points.about(origin), _at_frame(last.twist, -origin)
-    power = local.power(twist, 0.0)
+    origin, local, twist, power = points.about_slowest(last.twist)
     return origin, twist / power[None], _ratio(power, dot(local.wrench, twist))
 
 
@@ -216,9 +212,9 @@ def _ratio(a: Array, b: Array) -> Array:
     return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 1.0)
 
 
-def _solve(matrix: Float[Array, "3 3 *rest"], right: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
-    """Solutions with symmetric matrices, however small the determinants are."""
-    return combined(dual(matrix, 0.0)[0], right)
+def _inverse(matrix: Float[Array, "3 3 *rest"]) -> Float[Array, "3 3 *rest"]:
+    """Inverses of symmetric matrices, however small the determinants are."""
+    return dual(matrix, 0.0)[0]
 
 
 def _speeds(velocity: Float[Array, "2 *rest"], still: Array | float) -> Float[Array, "*rest"]:
@@ -239,9 +235,9 @@ def _turned_to(origin: Float[Array, "2 *rest"], inverse: Float[Array, "3 3 *rest
     return inverse
 
 
-def _eye(like: Float[Array, "3 *rest"]) -> Float[Array, "3 3 *rest"]:
-    eye = jnp.eye(3, dtype=like.dtype).reshape(3, 3, *(1,) * (like.ndim - 1))
-    return jnp.broadcast_to(eye, (3, *like.shape))
+def _viscous(point: Array, factor: Array) -> Float[Array, "3 3 *rest"]:
+    """The stiffness of points that resist in proportion to their velocity."""
+    return _summed_over_points(point, factor, jnp.zeros_like(factor), factor)
 
 
 def _summed_over_points(point: Array, xx: Array, xy: Array, yy: Array) -> Float[Array, "3 3 *rest"]:

@@ -66,6 +66,12 @@ class Meeting(NamedTuple):
     other: int | None  # None for a finger or a fixture
     is_fixture: bool
 
+    def finger_of(self, bodies: tuple[Body, ...]) -> Finger | Wall:
+        """Return the shape of what the slider meets."""
+        finger = bodies[self.other].finger if self.other is not None else self.body and self.body.finger
+        assert finger is not None
+        return finger
+
     def found_at(self, frames: tuple[BodyFrame, ...], bodies: tuple[Body, ...]) -> FingerMotion:
         """Return what the slider meets, while the sliders are at these frames."""
         if self.other is None:
@@ -106,8 +112,7 @@ def meetings_of(
 
 def contact_counts(bodies: tuple[Body, ...], meetings: list[Meeting]) -> list[int]:
     """Return the number of contacts of each meeting."""
-    frames = tuple(BodyFrame.at(Vec3(*(jnp.zeros_like(body.center.x),) * 3)) for body in bodies)
-    return [num_contacts(m.found_at(frames, bodies).finger, bodies[m.slider].outline) for m in meetings]
+    return [num_contacts(m.finger_of(bodies), bodies[m.slider].outline) for m in meetings]
 
 
 def depth_of_sliders(bodies: tuple[Body, ...], meetings: list[Meeting], pose: Vec3, fraction: float) -> Scalar:

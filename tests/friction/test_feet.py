@@ -68,11 +68,13 @@ def test_float32():
     assert np.all(np.isfinite(twist))
 
 
-def test_surface_of_feet():
+def test_surface_of_feet(tmp_path):
     support = pj.Support.tripod(TRIPOD, load=2.0)
     surface = Slider.on(BOX, support, exact=True).surface
     assert isinstance(surface, Feet)
     np.testing.assert_allclose(surface.length, support.radius_of_gyration)
+    surface.save(tmp_path / "feet.json")
+    np.testing.assert_array_equal(pj.LimitSurface.load(tmp_path / "feet.json").form().limit, support.limit)
     for twist in np.array([[1.0, 0.3, 0.0], [0.2, -1.0, 30.0]]):
         wrench = surface.wrench(twist)
         np.testing.assert_allclose(wrench, support.wrench(twist), atol=1e-12)
