@@ -28,9 +28,11 @@ class MixedSurfaces(NamedTuple):
     points: SupportPoints
     is_exact: Bool[Array, "sliders *batch"]
 
-    def patch(self, wrench: Float[Array, "3 *rest sliders batch"]) -> tuple[Array, Array, Array]:
+    def patch(
+        self, wrench: Float[Array, "3 *rest sliders batch"], near: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         """As of each kind."""
-        both = zip(self.points.patch(wrench), self.polynomial.patch(wrench), strict=True)
+        both = zip(self.points.patch(wrench, near), self.polynomial.patch(wrench), strict=True)
         gauge, normal, curvature = (
             jnp.where(jnp.broadcast_to(self.is_exact, exact.shape), exact, smooth) for exact, smooth in both
         )
@@ -65,12 +67,12 @@ class LinearPatch(NamedTuple):
     curvature: Float[Array, "3 3 *rest sliders batch"]  # C
 
     @staticmethod
-    def at(surface: Surface, wrench: Float[Array, "3 *rest sliders batch"]) -> "LinearPatch":
-        """The limit surface at a wrench; for a zero wrench, at another one, with a gauge of zero."""
+    def at(surface: Surface, wrench: Float[Array, "3 *rest sliders batch"], near: Array | None = None) -> "LinearPatch":
+        """The limit surface at a wrench, with a normal `near` by; for a zero wrench at another one, with gauge zero."""
         size = jnp.max(jnp.abs(wrench), axis=0)
         acts = size > jnp.finfo(size.dtype).tiny ** 0.2  # of a smaller one, H may be zero
         axis = jnp.zeros_like(wrench).at[0].set(1.0)
-        gauge, normal, curvature = surface.patch(jnp.where(acts[None], wrench, axis))
+        gauge, normal, curvature = surface.patch(jnp.where(acts[None], wrench, axis), near)
         return LinearPatch(jnp.where(acts, gauge, 0.0), normal, curvature)
 
     def ellipsoid(self) -> Float[Array, "3 3 *rest sliders batch"]:

@@ -68,6 +68,7 @@ class Start(NamedTuple):
     force: Float[Array, "2 contacts *batch"]
     dissipation: Float[Array, "sliders *batch"]
     basic: Bool[Array, "rows *batch"]
+    normal: Float[Array, "3 sliders *batch"]  # of the limit surfaces; zero if not known
 
     @staticmethod
     def none(contacts: int, dissipation: Float[Array, "sliders *batch"]) -> "Start":
@@ -75,7 +76,8 @@ class Start(NamedTuple):
         zero = jnp.zeros_like(dissipation[0])
         force, basic = (jnp.stack([zero] * rows) for rows in (2 * contacts, 3 * contacts + len(dissipation)))
         force = force.reshape(2, contacts, *zero.shape)
-        return Start(zero > 0, force, jnp.zeros_like(dissipation), basic > 0)
+        still = jnp.zeros_like(dissipation)
+        return Start(zero > 0, force, still, basic > 0, jnp.stack([still] * 3))
 
 
 class _Round(NamedTuple):
@@ -122,7 +124,7 @@ def solve_sliders(
     if start is None:
         start = Start.none(problem.count, jnp.zeros_like(problem.rows[0, 0, :, 0]))
     start = Start(*(jnp.broadcast_to(x, (*x.shape[:-1], *pushes.shape)) for x in start))
-    before = _motion(problem, start.force, start.dissipation, start.basic, 0)
+    before = _motion(problem, start.force, start.dissipation, start.basic, 0, near=start.normal)
     found = _where(anew & pushes, _in_rounds(problem, before, start.exists & pushes, pushes & anew), before)
     is_jam = found.status == Status.JAMMED
     found = _refined(problem, found, pushes & ~is_jam & (anew | start.exists))
@@ -159,7 +161,7 @@ def _next_round(problem: SlidersProblem, mean: Float[Array, "3 3 sliders batch"]
     lcp = SlidersLCP.of(problem, laws)
     found, newton = lemke(lcp.matrix, lcp.q, _cover(state.number, lcp.q), state.ongoing), now.is_newton
     force = lcp.force(found.z) * lcp.force_unit[None]
-    patch = LinearPatch.at(problem.surface, problem.wrenches(force))
+    patch = LinearPatch.at(problem.surface, problem.wrenches(force), now.patch.normal)
     by_gauge = lcp.speed_unit**2 * jnp.clip(patch.gauge, 1 / MAX_FACTOR, MAX_FACTOR)
     weight = jnp.where(newton[None], lcp.dissipation(found.z), by_gauge)
     dissipation = jnp.where(newton[None] | (patch.gauge >= RESTING_GAUGE), weight, 0.0)
@@ -201,10 +203,11 @@ def _motion(
     basic: Bool[Array, "rows batch"],
     rounds: int | Int[Array, ""],
     patch: LinearPatch | None = None,
+    near: Float[Array, "3 sliders batch"] | None = None,
 ) -> SlidersMotion:
     """The motion under contact forces, given the dissipation of each slider, and how far it violates any condition."""
     wrench = problem.wrenches(force)
-    patch = LinearPatch.at(problem.surface, wrench) if patch is None else patch
+    patch = LinearPatch.at(problem.surface, wrench, near) if patch is None else patch
     twist = dissipation[None] * patch.normal
     speed, total = jnp.max(jnp.abs(twist), axis=(0, 1)), jnp.max(jnp.abs(force[0]), axis=0)
     normal, tangential = force / jnp.where(total > 0, total, 1.0)[None, None]
@@ -252,8 +255,8 @@ def _refined(problem: SlidersProblem, motion: SlidersMotion, wanted: Bool[Array,
         lcp, z = _at(problem, state.last, PROXIMAL[item])
         z = z - _solve_basic(lcp, motion.basic, lcp.complements(z, state.last.patch))
         dissipation = jnp.maximum(lcp.dissipation(z), 0.0)
-        new = _motion(problem, lcp.force(z) * lcp.force_unit[None], dissipation, motion.basic, 0)
-        new = new._replace(rounds=motion.rounds)
+        force, near = lcp.force(z) * lcp.force_unit[None], state.last.patch.normal
+        new = _motion(problem, force, dissipation, motion.basic, motion.rounds, near=near)
         is_better = state.ongoing & (new.violation < state.best.violation)
         best = _where(is_better, new, state.best)
         goes_on = (new.violation < state.last.violation / 2) | (best.violation > TOLERANCE[item])
@@ -279,7 +282,7 @@ def differentiable_motion(problem: SlidersProblem, motion: SlidersMotion) -> Sli
     z = _root(problem, motion, jax.lax.stop_gradient(z))
     force, dissipation = lcp.force(z) * lcp.force_unit[None], lcp.dissipation(z)
     wrench = problem.wrenches(force)
-    twist = dissipation[None] * LinearPatch.at(problem.surface, wrench).normal
+    twist = dissipation[None] * LinearPatch.at(problem.surface, wrench, motion.patch.normal).normal
     found = motion._replace(twist=twist, wrench=wrench, force=force, dissipation=dissipation)
     return _where(moves, found, motion)
 
@@ -304,7 +307,8 @@ def _root_jvp(primals, tangents):
 
     def complements(problem: SlidersProblem) -> Float[Array, "rows batch"]:
         lcp = _at(problem, motion, 0.0)[0]
-        return lcp.complements(z, LinearPatch.at(problem.surface, lcp.problem.wrenches(lcp.force(z))))
+        wrench = lcp.problem.wrenches(lcp.force(z))
+        return lcp.complements(z, LinearPatch.at(problem.surface, wrench, motion.patch.normal))
 
     _, change = eqx.filter_jvp(complements, (problem,), (changes,))
     lcp, _ = _at(problem, motion, proximal)

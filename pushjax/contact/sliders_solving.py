@@ -59,7 +59,7 @@ def solve_touching(forms: tuple[Form, ...], touching: Touching, guess: Start | N
     ones = jnp.ones_like(displacement_unit)
     units = jnp.stack([jnp.stack([ones, ones, 1 / form.length]) for form in forms], axis=1) * displacement_unit
     moves = motion.status == Status.MOVING
-    found = Start(moves, motion.force, motion.dissipation, motion.basic)
+    found = Start(moves, motion.force, motion.dissipation, motion.basic, motion.patch.normal)
     return SlidersSolution(
         Vec3.of(motion.twist * units),
         Vec3.of(motion.wrench * force_unit),

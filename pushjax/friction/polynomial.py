@@ -75,9 +75,12 @@ class Polynomial(NamedTuple):
         return jnp.sqrt(h) if self.degree == 2 else jnp.sqrt(jnp.sqrt(h))
 
     def patch(
-        self, wrench: Float[Array, "3 *rest"]
+        self, wrench: Float[Array, "3 *rest"], near: Array | None = None
     ) -> tuple[Float[Array, "*rest"], Float[Array, "3 *rest"], Float[Array, "3 3 *rest"]]:
-        """The gauge gamma(F) = H(F)^(1/d) of wrenches other than zero, its gradient, and its Hessian at gamma = 1."""
+        """The gauge gamma(F) = H(F)^(1/d) of wrenches other than zero, its gradient, and its Hessian at gamma = 1.
+
+        There is no search, which could start `near`.
+        """
         degree, gauge = self.degree, self.root(self.value(wrench))
         unit = wrench / gauge[None]
         normal = self.gradient(unit) / degree

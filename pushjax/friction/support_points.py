@@ -24,8 +24,9 @@ from pushjax._math.arrays import combined, dot, dual
 STANDS_STILL = {4: 1e-5, 8: 1e-10}  # speed below which a point stands still, in units of the mean one
 SLOW = {4: 1e-4, 8: 1e-8}  # least speed of a point, in the same unit, where it resists in proportion to its velocity
 RATE, MAX_STEPS = 0.3, 60  # by which that speed falls from one full Newton step to the next, and most steps
+MAX_STEPS_NEAR = 8  # steps from a twist near by, which starts with the least of these speeds
 CLOSE_STEP = 1e-3  # a step, in units of mean speeds, after which one more is enough
-LENGTHS = (1.0, 0.6, 0.3, 0.1, 0.03)  # of a step, that are tried
+LENGTHS, ROUNDOFF = (1.0, 0.6, 0.3, 0.1, 0.03), 8  # of a step, that are tried; times eps, error of D
 
 
 class SupportPoints(NamedTuple):
@@ -56,7 +57,9 @@ class SupportPoints(NamedTuple):
         Its points resist in proportion to their velocity, each with the factor that it has at the twist.
         """
         points, total = self._points(twist)
-        origin, local, twist, power = points.about_slowest(twist)
+        origin = points.place(points.slowest(twist))
+        local, twist = points.about(origin), _at_frame(twist, -origin)
+        power = local.power(twist, 0.0)
         moves = power > 0
         velocity = local.velocity(twist / jnp.where(moves, power, 1.0)[None])
         factor = local.limit / _speeds(velocity, SLOW[twist.dtype.itemsize])
@@ -75,14 +78,15 @@ class SupportPoints(NamedTuple):
         return SupportPoints(point, limit), valid
 
     def patch(
-        self, wrench: Float[Array, "3 *rest"]
+        self, wrench: Float[Array, "3 *rest"], near: Float[Array, "3 *rest"] | None = None
     ) -> tuple[Float[Array, "*rest"], Float[Array, "3 *rest"], Float[Array, "3 3 *rest"]]:
         """The gauge of wrenches other than zero, its gradient, and its Hessian where the gauge is one.
 
-        Gauge and gradient can be differentiated.
+        Gauge and gradient can be differentiated. The search starts from gradients `near` by, where they are not zero.
         """
         points, total = self._points(wrench)
-        origin, twist, scale = without_derivatives(_search, points)
+        near = jnp.zeros_like(wrench) if near is None else near
+        origin, twist, scale = without_derivatives(_search, points, near)
         points, still = points.about(origin).scaled(scale), STANDS_STILL[wrench.dtype.itemsize]
         velocity = points.velocity(twist)
         force = velocity / _speeds(velocity, still)[None]
@@ -136,12 +140,13 @@ class _Points(NamedTuple):
         """D of a twist."""
         return jnp.sum(self.limit * _speeds(self.velocity(twist), still), axis=0)
 
-    def about_slowest(self, twist: Float[Array, "3 *rest"]) -> tuple[Array, "_Points", Array, Array]:
-        """The point with a load that moves least, everything about that point, the twist too, and D of the twist."""
-        speed = jnp.where(self.limit > 0, _speeds(self.velocity(twist), 0.0), jnp.inf)
-        origin = jnp.take_along_axis(self.point, jnp.argmin(speed, axis=0)[None, None], 1)[:, 0]
-        local, twist = self.about(origin), _at_frame(twist, -origin)
-        return origin, local, twist, local.power(twist, 0.0)
+    def place(self, index: Int[Array, "*rest"]) -> Float[Array, "2 *rest"]:
+        """A point by its index."""
+        return jnp.take_along_axis(self.point, index[None, None], 1)[:, 0]
+
+    def slowest(self, twist: Float[Array, "3 *rest"]) -> Int[Array, "*rest"]:
+        """The index of the point with a load that moves least."""
+        return jnp.argmin(jnp.where(self.limit > 0, _speeds(self.velocity(twist), 0.0), jnp.inf), axis=0)
 
     def stiffness(self, velocity: Array, force: Array, still: Array | float) -> Float[Array, "3 3 *rest"]:
         """The derivative of the total force by the twist, given forces in units of their limits."""
@@ -167,22 +172,35 @@ class _Points(NamedTuple):
 class _Search(NamedTuple):
     """State between two steps."""
 
-    twist: Float[Array, "3 *rest"]
+    index: Int[Array, "*rest"]  # the slowest point
+    twist: Float[Array, "3 *rest"]  # about that point, where it is right to more digits
     force: Float[Array, "2 points *rest"]  # in units of the limits
     still: Float[Array, "*rest"]  # e
     ongoing: Bool[Array, "*rest"]
     number: Int[Array, ""]
 
 
-def _search(points: _Points) -> tuple[Float[Array, "2 *rest"], Float[Array, "3 *rest"], Float[Array, "*rest"]]:
+def _search(
+    points: _Points, near: Float[Array, "3 *rest"]
+) -> tuple[Float[Array, "2 *rest"], Float[Array, "3 *rest"], Float[Array, "*rest"]]:
     """Find the largest F . V / D(V): the slowest point, V about that point with D(V) = 1, and 1 / (F . V)."""
     least, limit = STANDS_STILL[points.wrench.dtype.itemsize], points.limit
-    first = combined(_inverse(_viscous(points.point, limit)), points.wrench)
     lengths = jnp.asarray(LENGTHS, limit.dtype).reshape(-1, *(1,) * limit.ndim)
 
+    def start(twist: Array, still: Array) -> _Search:
+        index, velocity = points.slowest(twist), points.velocity(twist)
+        force = velocity / jnp.maximum(_speeds(velocity, 0.0), least)[None]
+        local = _at_frame(twist, -points.place(index))
+        return _Search(index, local, force, still, still > 0, jnp.zeros((), jnp.int32))
+
     def step(state: _Search) -> _Search:
-        twist, force, still, _, number = state
-        origin, local, twist, power = points.about_slowest(twist)
+        starts_anew = is_near & (state.number == MAX_STEPS_NEAR) & state.ongoing
+        state = _where(starts_anew, anew, state)
+        index, twist, force, still, _, number = state
+        origin = points.place(index)
+        slowest = points.about(origin).slowest(twist)
+        local, twist = points.about(points.place(slowest)), _at_frame(twist, origin - points.place(slowest))
+        power = local.power(twist, 0.0)
         # in units of mean speeds
         local, twist = local.scaled(_ratio(power, dot(local.wrench, twist))), twist / power[None]
         velocity = local.velocity(twist)
@@ -190,21 +208,39 @@ def _search(points: _Points) -> tuple[Float[Array, "2 *rest"], Float[Array, "3 *
         change = local.newton_step(local.stiffness(velocity, force, still), twist, still)
         moved, along = local.velocity(change), velocity / speed[None]
         force = along + (moved - force * jnp.sum(along * moved, axis=0)[None]) / speed[None]
-        force = force / jnp.maximum(_speeds(force, 0.0), 1.0)[None]
+        size = _speeds(force, 0.0)
+        force = force / jnp.maximum(size, 1.0)[None]
         tried = _speeds(velocity[:, None] + lengths[None] * moved[:, None], still)
-        length = lengths.reshape(-1)[jnp.argmin(jnp.sum(limit[None] * tried, axis=1), axis=0)]
-        twist = _at_frame(twist + length[None] * change, origin)
-        is_full, large = length == 1, jnp.max(jnp.abs(change), axis=0) > CLOSE_STEP
-        ongoing = ~is_full | large | (still > least)
-        return _Search(twist, force, jnp.where(is_full, jnp.maximum(RATE * still, least), still), ongoing, number + 1)
+        powers = jnp.sum(limit[None] * tried, axis=1)
+        is_full = powers[0] <= (1 + ROUNDOFF * jnp.finfo(speed.dtype).eps) * jnp.min(powers, axis=0)
+        length = jnp.where(is_full, 1.0, lengths.reshape(-1)[jnp.argmin(powers, axis=0)])
+        twist = twist + length[None] * change
+        by = jnp.max(jnp.abs(change), axis=0)
+        # of the force at any point
+        error = jnp.max(jnp.where(limit > 0, jnp.maximum(_speeds(moved, 0.0) / speed, size - 1), 0.0), axis=0)
+        ongoing = ~is_full | (jnp.maximum(by, error) > CLOSE_STEP) | (still > least)
+        still = jnp.where(is_full, jnp.maximum(RATE * still, least), still)
+        new = _Search(slowest, twist, force, still, ongoing, number + 1)
+        return _where(state.ongoing, new, state)
 
-    velocity = points.velocity(first)
-    force = velocity / jnp.maximum(_speeds(velocity, 0.0), least)[None]
-    still = jnp.full_like(first[0], RATE)
-    start = _Search(first, force, still, still > 0, jnp.zeros((), jnp.int32))
-    last = jax.lax.while_loop(lambda state: jnp.any(state.ongoing) & (state.number < MAX_STEPS), step, start)
-    origin, local, twist, power = points.about_slowest(last.twist)
-    return origin, twist / power[None], _ratio(power, dot(local.wrench, twist))
+    viscous = combined(_inverse(_viscous(points.point, limit)), points.wrench)
+    is_near = dot(points.wrench, near) * points.power(viscous, 0.0) > dot(points.wrench, viscous) * points.power(
+        near, 0.0
+    )
+    anew = start(viscous, jnp.full_like(viscous[0], RATE))
+    there = start(near, jnp.full_like(viscous[0], least))
+    last = jax.lax.while_loop(
+        lambda state: jnp.any(state.ongoing) & (state.number < MAX_STEPS), step, _where(is_near, there, anew)
+    )
+    origin = points.place(last.index)
+    local, power = points.about(origin), points.about(origin).power(last.twist, 0.0)
+    return origin, last.twist / power[None], _ratio(power, dot(local.wrench, last.twist))
+
+
+def _where(condition: Bool[Array, "*rest"], a: _Search, b: _Search) -> _Search:
+    """`a` where the condition holds, else `b`, with the larger number."""
+    chosen = jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+    return chosen._replace(number=jnp.maximum(a.number, b.number))
 
 
 def _ratio(a: Array, b: Array) -> Array:
