@@ -18,11 +18,13 @@ from pushjax._internal.checks import (
     warn,
 )
 from pushjax.friction.ellipsoid import Ellipsoid
+from pushjax.friction.feet import Feet
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.quartic import Quartic
 from pushjax.friction.surface_distributions import (
     Deterministic,
     GramQuartic,
+    RandomFeet,
     SumOfSquaresQuartic,
     SurfaceDistribution,
     WishartEllipsoid,
@@ -44,7 +46,8 @@ class FrictionModel(eqx.Module):
     Args:
         dof: Degrees of freedom n of the Wishart distribution, at least 3 for an `Ellipsoid` and at least 9 for a
             `Quartic` (the size of the sampled matrix). It need not be an integer. The relative variance of H along a
-            ray is 2 / n. None if the limit surface is known exactly. Not checked if traced.
+            ray is 2 / n; for exact support points, that of the friction limit of each. None if the limit surface is
+            known exactly. Not checked if traced.
         friction: Coefficient of contact friction mu, or the range (lowest, highest), shape (2,), on which it is
             uniformly distributed.
         sampler: Distribution of a `Quartic`. "gram" (Zhou et al. 2017) takes every convex quartic, and repairs samples
@@ -108,7 +111,7 @@ class FrictionModel(eqx.Module):
         Raises:
             ValueError: If the mean is a `Quartic` and `dof` is less than 9, or if the sampler is "sum_of_squares" and
                 the quartic is not a sum of five squared quadratic forms. Not checked for traced values.
-            TypeError: If the surface is neither an `Ellipsoid` nor a `Quartic`.
+            TypeError: If the surface is not an `Ellipsoid`, a `Quartic` or `Feet`.
         """
         dtype = surface.length.dtype
         if self.dof is None:
@@ -116,8 +119,10 @@ class FrictionModel(eqx.Module):
         dof = self.dof.astype(dtype)
         if isinstance(surface, Ellipsoid):
             return WishartEllipsoid.of(surface, dof)
+        if isinstance(surface, Feet):
+            return RandomFeet(surface, dof)
         if not isinstance(surface, Quartic):
-            raise TypeError(f"surface: expected an Ellipsoid or a Quartic; got a {type(surface).__name__}")
+            raise TypeError(f"surface: expected an Ellipsoid, a Quartic or Feet; got a {type(surface).__name__}")
         _check_dof(dof, 9, "a quartic's Gram matrix")
         return (GramQuartic if self.sampler == "gram" else SumOfSquaresQuartic).of(surface, dof)
 

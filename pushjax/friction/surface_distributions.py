@@ -1,6 +1,6 @@
 """Distributions of limit surfaces around a mean, all of whose samples are convex.
 
-There are three that are random, for n degrees of freedom:
+There are four that are random, for n degrees of freedom:
 
 Ellipsoid         A ~ W(A_mean, n) / n, the Wishart distribution: mean A_mean. The variance of A_ij is
                   (A_ij^2 + A_ii A_jj) / n, with the entries of A_mean.
@@ -12,6 +12,8 @@ Quartic, "sum_of_squares"
                   H = sum_k (F' X_k F)^2 / (1 + 2 / m), each X_k ~ W(P_k, m) / m, where sum_k (F' P_k F)^2 is the mean.
                   The mean of H is exact, and all samples are convex. m is chosen such that the relative variance of H,
                   averaged over rays, is 2 / n.
+Feet              The friction limit of each support point ~ chi2(n) / n times its mean, all independent: a relative
+                  variance of 2 / n.
 
 A traced `dof` (under `jit`, `grad` or `vmap`) is not checked. If it is so small that the Wishart distribution does not
 exist, the sampled surface is NaN, and every step of a rollout with it has the status INVALID.
@@ -47,6 +49,7 @@ from pushjax._math.linalg import cholesky
 from pushjax._math.wishart import sample_wishart
 from pushjax.friction.convexity import Gram, antisymmetric_of, coefficients_of, max_feasible_scale
 from pushjax.friction.ellipsoid import Ellipsoid
+from pushjax.friction.feet import Feet
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.quartic import Quartic
 from pushjax.friction.sum_of_squares import decompose, squared_quadratics
@@ -119,6 +122,19 @@ class WishartEllipsoid(SurfaceDistribution):
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         surface = eqx.tree_at(lambda s: s.A, self.mean, sample_wishart(key, self.factor, self.dof))
+        return SurfaceSample(surface, jnp.zeros_like(self.dof))
+
+
+class RandomFeet(SurfaceDistribution):
+    """Support points with random friction limits."""
+
+    mean: Feet
+    dof: Float[Array, ""]
+
+    def sample(self, key: PRNGKeyArray) -> SurfaceSample:
+        half = jnp.where(self.dof > 0, self.dof, jnp.nan) / 2
+        factor = jax.random.gamma(key, half, self.mean.limit.shape, half.dtype) / half
+        surface = eqx.tree_at(lambda s: s.limit, self.mean, self.mean.limit * factor)
         return SurfaceSample(surface, jnp.zeros_like(self.dof))
 
 

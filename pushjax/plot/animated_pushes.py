@@ -31,7 +31,7 @@ MARGIN = 0.04  # width of the empty margin, in units of what is shown
 
 
 def animate(
-    shape: Shape,
+    shape: Shape | Sequence[Shape],
     hand: Hand,
     pushes: Trajectory | Recording | Mapping[str, Trajectory | Recording],
     *,
@@ -50,7 +50,7 @@ def animate(
     squeeze are shown if `friction` is given.
 
     Args:
-        shape: Outline of the slider.
+        shape: Outline of the slider, or of each of several.
         hand: The hand.
         pushes: One push, or several by name, all of that shape and hand: trajectories of `rollout`, or recordings
             (`pushjax.datasets.Recording`), which are shown without forces.
@@ -77,8 +77,9 @@ def animate(
     unknown = sorted(set(measured_by_name) - set(by_name))
     if unknown:
         raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
+    shapes = (shape,) if isinstance(shape, Shape) else tuple(shape)
     panels = [
-        PushPanel(shape, hand, push, measured_by_name.get(name), forces, friction) for name, push in by_name.items()
+        PushPanel(shapes, hand, push, measured_by_name.get(name), forces, friction) for name, push in by_name.items()
     ]
     fractions = _frame_fractions(panels, frames)
     largest_force = max(panel.largest_force for panel in panels)
@@ -176,8 +177,8 @@ def _frame_fractions(panels: list[PushPanel], frames: int) -> np.ndarray:
     """Return for each frame the fraction of the steps that is done, from 0 to where the last push stops moving."""
     last_fraction = 0.0
     for panel in panels:
-        steps = len(panel.outline) - 1
-        moving = [np.any(np.diff(points, axis=0) != 0, axis=(1, 2)) for points in (panel.outline, *panel.fingers)]
+        steps = len(panel.outlines[0]) - 1
+        moving = [np.any(np.diff(points, axis=0) != 0, axis=(1, 2)) for points in (*panel.outlines, *panel.fingers)]
         moving_steps = np.flatnonzero(np.any(moving, axis=0))
         # includes the step whose status says why nothing moves any more
         stop_step = steps if moving_steps.size == 0 else min(moving_steps[-1] + 2, steps)
@@ -194,7 +195,7 @@ def _equally_spaced(end: float, frames: int) -> np.ndarray:
 
 def _share_limits(figure: Figure, all_axes: list[Axes], panels: list[PushPanel]) -> None:
     """Give all panels one range that holds everything at all times, and the figure the proportions of that range."""
-    parts = [part for panel in panels for part in (panel.outline, *panel.fingers)]
+    parts = [part for panel in panels for part in (*panel.outlines, *panel.fingers)]
     parts += [panel.measured for panel in panels if panel.measured is not None]
     _set_limits(all_axes[0], [part.reshape(-1, 2) for part in parts])
     wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())

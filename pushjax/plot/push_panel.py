@@ -36,19 +36,22 @@ class PushPanel:
 
     def __init__(
         self,
-        shape: Shape,
+        shapes: tuple[Shape, ...],  # of each slider; the pose of one has no axis for them
         hand: Hand,
         push: Trajectory | Recording,
         measured: np.ndarray | None,  # (points, 3), poses to draw over it, world, m and rad
         forces: bool,  # whether to draw contacts and forces
         friction: float | None,  # at the contacts, to draw the squeeze that holds the slider
     ):
-        pose, points = np.asarray(push.pose, float), vertices(shape)
-        self.outline, self.center = placed_outline(points, pose), centroids(shape, pose)  # of the slider, by point
+        pose = np.asarray(push.pose, float)
+        poses = pose.reshape(len(pose), -1, 3).swapaxes(0, 1)
+        # of each slider, by point
+        self.outlines = [placed_outline(vertices(one), own) for one, own in zip(shapes, poses, strict=True)]
+        self.centers = [centroids(one, own) for one, own in zip(shapes, poses, strict=True)]
         self.fingers = fingers_along(hand, push.hand if isinstance(push, Recording) else push.configuration)
         if len(self.fingers[0]) != len(pose):
             raise ValueError(f"push has {len(pose)} poses, but {len(self.fingers[0])} configurations")
-        self.measured = None if measured is None else placed_outline(points, np.asarray(measured, float))
+        self.measured = None if measured is None else placed_outline(vertices(shapes[0]), np.asarray(measured, float))
         # Contacts and forces (points, contacts, 2) of the step that led to each point, and that step in words.
         self.contact = self.force = np.zeros((len(pose), 0, 2))
         self.words = [""] * len(pose)
@@ -59,8 +62,8 @@ class PushPanel:
         self.failed, self.stopped, self.words = int(push.first_failure), int(push.stopped), _words(push)
         if forces:
             self.contact, self.force = _in_world(pose, push)
-        if forces and friction is not None:
-            self.squeeze = squeeze_forces(shape, hand, push, friction)
+        if forces and friction is not None and len(shapes) == 1:
+            self.squeeze = squeeze_forces(shapes[0], hand, push, friction)
 
     @property
     def largest_force(self) -> float:
@@ -69,12 +72,14 @@ class PushPanel:
 
     def add_artists(self, axes: Axes, largest_force: float) -> None:
         """Add the artists, with arrows to the scale of the largest force of all panels, N."""
-        size = float(np.ptp(self.outline[0], axis=0).max())
+        size = float(np.ptp(self.outlines[0][0], axis=0).max())
         self.scale = MAX_ARROW_LENGTH * size / largest_force if largest_force > 0 else 0.0
         self.weakest = MIN_FORCE * largest_force
-        axes.plot(*self.outline[0].T, color=GRAY, lw=1.0, label="start")
-        (self.slider_line,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
-        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centroid")
+        for points in self.outlines:
+            axes.plot(*points[0].T, color=GRAY, lw=1.0, label="start" if points is self.outlines[0] else None)
+        labels = [("slider", "its centroid"), *[(None, None)] * (len(self.outlines) - 1)]
+        self.slider_lines = [axes.plot([], [], color=BLACK, lw=1.5, label=label)[0] for label, _ in labels]
+        self.traces = [axes.plot([], [], color=BLUE, lw=1.2, label=label)[0] for _, label in labels]
         self.finger_lines = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in self.fingers]
         label = None if self.measured is None else "measured"
         (self.measured_line,) = axes.plot([], [], "--", color=RED, lw=1.3, label=label)
@@ -89,9 +94,12 @@ class PushPanel:
 
     def draw(self, fraction: float) -> None:
         """Show the push at a share of its steps, from 0 to 1."""
-        k = round(fraction * (len(self.outline) - 1))
-        self.slider_line.set_data(*self.outline[k].T)
-        self.trace.set_data(*self.center[: k + 1].T)
+        k = round(fraction * (len(self.outlines[0]) - 1))
+        for line, trace, points, center in zip(
+            self.slider_lines, self.traces, self.outlines, self.centers, strict=True
+        ):
+            line.set_data(*points[k].T)
+            trace.set_data(*center[: k + 1].T)
         for line, finger in zip(self.finger_lines, self.fingers, strict=True):
             line.set_data(*finger[k].T)
         if self.measured is not None:
@@ -122,6 +130,8 @@ def _in_world(pose: np.ndarray, push: Trajectory) -> tuple[np.ndarray, np.ndarra
     """Return for each pose the contacts (mm) and forces (N) of the step that led there, world; zero for the first."""
     point, force = contact_forces(push)
     here = pose[1:, None]
+    if pose.ndim == 3:  # each contact is in the frame of a slider
+        here = pose[1:, [int(first.removeprefix("slider ")) for first, _ in push.contacts]]
     in_world = MM * to_world(here, point), to_world(here * [0, 0, 1], force)
     contact, force = (np.concatenate([np.zeros_like(part[:1]), part]) for part in in_world)
     return contact, force

@@ -31,7 +31,7 @@ ARROW_LENGTH = 0.7  # length of the arrow of a unit force, in units of the slide
 
 
 def push_figure(
-    shape: Shape,
+    shape: Shape | Sequence[Shape],
     hand: Hand,
     pushes: Mapping[str, Trajectory],
     frames: int = 4,
@@ -45,7 +45,7 @@ def push_figure(
     drawn too. The title of a push with a failed step says so.
 
     Args:
-        shape: Outline of the slider.
+        shape: Outline of the slider, or of each of several.
         hand: The hand.
         pushes: Trajectories by name.
         frames: Number of moments between start and end, among those in which the slider moves.
@@ -53,19 +53,25 @@ def push_figure(
             end are drawn, where it does, per unit of squeeze (`squeeze_forces`).
         fixtures: Walls and bodies that do not move, in every panel.
     """
-    held = False
+    held, shapes = False, (shape,) if isinstance(shape, Shape) else tuple(shape)
     with plt.rc_context(STYLE):
         figure, all_axes = panel_row(len(pushes), 3.1, 3.9, shared=True)
         for axes, (name, push) in zip(all_axes, pushes.items(), strict=True):
             pose, fingers = np.asarray(push.pose), finger_poses(hand, push.configuration)
-            for k, color in _moments(pose, frames):
+            poses = pose.reshape(len(pose), -1, 3)
+            for k, color in _moments(pose.reshape(len(pose), -1), frames):
                 width = 0.8 if color == GRAY else 1.4
-                outline(axes, shape, pose[k], color, width)
+                for one, own in zip(shapes, poses[k], strict=True):
+                    outline(axes, one, own, color, width)
                 hand_at(axes, hand, fingers[k], color, width)
-            axes.plot(*centroids(shape, pose).T, color=BLUE, lw=1.4, label="centroid of the slider", zorder=4)
-            squeeze = None if friction is None else squeeze_forces(shape, hand, push, friction)
+            for k, one in enumerate(shapes):
+                label = "centroid of the slider" if k == 0 else None
+                axes.plot(*centroids(one, poses[:, k]).T, color=BLUE, lw=1.4, label=label, zorder=4)
+            squeeze = None
+            if friction is not None and len(shapes) == 1:
+                squeeze = squeeze_forces(shapes[0], hand, push, friction)
             if squeeze is not None:
-                length, held = ARROW_LENGTH * float(np.ptp(vertices(shape), axis=0).max()), True
+                length, held = ARROW_LENGTH * float(np.ptp(vertices(shapes[0]), axis=0).max()), True
                 for tip, force in zip(*squeeze, strict=True):  # the arrows end at the contacts
                     arrow(axes, MM * (tip - length * force), MM * tip, ORANGE, 2.0)
             draw_fixtures(axes, fixtures)

@@ -21,6 +21,9 @@ from pushjax._internal.checks import (
     traced,
     warn,
 )
+from pushjax.contact.problem import check_solver
+from pushjax.contact.scaled_problem import ContactSolver
+from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.friction_model import warn_about_percent
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
@@ -30,7 +33,7 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.path import checked_path
 from pushjax.simulation.slider import Slider, fixture_overlaps, overlaps
-from pushjax.simulation.sliders_step import can_push
+from pushjax.simulation.sliders_step import can_push, mutual_overlaps
 
 POSES_AT_ONCE = 4096  # poses whose overlaps are computed together
 # Numbers beyond these are probably in other units: length of a surface, m; distance of a hand from the origin, in
@@ -112,6 +115,7 @@ def checked_sliders_arguments(
     pose: ArrayLike,
     friction: ArrayLike,
     between: ArrayLike | None,
+    pushes: int | None = None,
 ):
     """Return the arguments of a rollout of several sliders, as above, with their friction (fingers, between)."""
     if not sliders:
@@ -121,7 +125,8 @@ def checked_sliders_arguments(
     for k, slider in enumerate(sliders):
         check_type(f"slider[{k}]", slider, Slider)
     dtype, count = common_dtype(tuple(sliders), hand, pose, friction, path, between), len(sliders)
-    start = checked_array("pose", pose, (count, 3), dtype)
+    of_each = (pushes,) if pushes is not None and np.ndim(pose) == 3 else ()
+    start = checked_array("pose", pose, (*of_each, count, 3), dtype)
     mutual = as_float(between, dtype, "between")
     if mutual.shape not in ((), (count, count)):
         raise ValueError(f"between has shape {mutual.shape}; expected a scalar or ({count}, {count})")
@@ -134,10 +139,60 @@ def checked_sliders_arguments(
     concave = [k for k, slider in enumerate(sliders) if not can_push(slider.shape)]
     if len(concave) > 1:
         raise ValueError(f"slider: of each two, one must be a disk or a convex polygon; sliders {concave} are not")
-    each = [checked_rollout_arguments(s, hand, path, start[k], friction) for k, s in enumerate(sliders)]
+    each = [checked_rollout_arguments(s, hand, path, start[..., k, :], friction, pushes) for k, s in enumerate(sliders)]
+    sliders = tuple(one[0] for one in each)
+    _check_start_beside_each_other(sliders, start)
     # all are of the dtype of `start`
     _, hand, path_array, _, mu = each[0]
-    return tuple(one[0] for one in each), hand, path_array, start, (mu, mutual)
+    return sliders, hand, path_array, start, (mu, mutual)
+
+
+def _check_start_beside_each_other(sliders: tuple[Slider, ...], poses: Array) -> None:
+    """Raise ValueError if two sliders start too deep in each other, unless values are traced."""
+    if traced((sliders, poses)) or len(sliders) < 2:
+        return
+    depth = np.asarray(mutual_overlaps(tuple(s.shape for s in sliders), poses.reshape(-1, len(sliders), 3)))
+    allowed = MAX_PENETRATION * min(float(s.surface.length) for s in sliders)
+    push, pair = np.unravel_index(np.argmax(depth), depth.shape)
+    if depth[push, pair] > allowed:
+        first, second = [(i, j) for i in range(len(sliders)) for j in range(i)][pair]
+        where = "" if poses.ndim == 2 else f" of push {push}"
+        raise ValueError(
+            f"pose{where}: sliders {second} and {first} start inside each other, by {1e3 * depth[push, pair]:.3g} mm; "
+            f"at most {1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
+        )
+
+
+def checked_scene(
+    slider: Slider | Sequence[Slider],
+    hand: Hand,
+    path: ArrayLike,
+    pose: ArrayLike,
+    friction: ArrayLike,
+    between: ArrayLike | None,
+    solver: ContactSolver | StickingSolver | None,
+    table: Table | None,
+    fixtures: Sequence[Wall | Fixture],
+    pushes: int | None = None,
+):
+    """Return everything about a rollout, random or not, of one slider or of several; checked where values are known."""
+    check_solver(solver)
+    if isinstance(slider, tuple | list):
+        if solver is not None or table is not None:
+            raise ValueError("solver and table are for one slider; got one with several sliders")
+        checked = checked_sliders_arguments(slider, hand, path, pose, friction, between, pushes)
+    else:
+        if between is not None:
+            raise ValueError("between is for several sliders; got one")
+        checked = checked_rollout_arguments(slider, hand, path, pose, friction, pushes)
+    start = checked[3]
+    fixed = checked_fixtures(fixtures, start.dtype)
+    if isinstance(slider, tuple | list):
+        for k, one in enumerate(checked[0]):
+            check_start_among_fixtures(one, fixed, start[..., k, :])
+    else:
+        check_start_among_fixtures(checked[0], fixed, start)
+    return *checked, checked_table(table, start.dtype), fixed
 
 
 def _check_columns(path: Array, hand: Hand) -> None:

@@ -17,22 +17,16 @@ from jaxtyping import PRNGKeyArray
 from pushjax._internal.checks import ArrayLike, check_count, check_type, traced, warn
 from pushjax._internal.compilation_cache import processor
 from pushjax._internal.progress import ProgressCallback, no_progress, progress_bar
-from pushjax.contact.problem import check_solver
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.table import Table
-from pushjax.simulation.arguments import (
-    check_start_among_fixtures,
-    checked_fixtures,
-    checked_rollout_arguments,
-    checked_table,
-)
 from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
 from pushjax.simulation.monte_carlo_tiles import Devices, Results, Rounds, Setup
+from pushjax.simulation.random_rollout import Distributions, checked_random_scene, shape_of
 from pushjax.simulation.slider import Slider
 
 TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
@@ -46,7 +40,7 @@ MANY_REPAIRS = 1 / 3  # share of repaired surfaces from which their distribution
 def monte_carlo(
     key: "PRNGKeyArray",  # as text, so that help shows this name and not the types behind it
     n: int,
-    slider: Slider,
+    slider: Slider | Sequence[Slider],
     hand: Hand,
     path: ArrayLike,
     *,
@@ -55,13 +49,14 @@ def monte_carlo(
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
     fixtures: Sequence[Wall | Fixture] = (),
+    between: ArrayLike | None = None,
     trajectories: bool = False,
     batch_size: int | None = None,
     devices: Sequence[Any] | None = None,
     checkpoint: str | Path | None = None,
     progress: bool | ProgressCallback = False,
 ) -> MonteCarlo:
-    """Push the slider `n` times along a path, each time under other friction.
+    """Push the slider, or several, `n` times along a path, each time under other friction.
 
     Push i is `random_rollout(fold_in(key, i), ...)`. Its bits depend on key, `batch_size`, `trajectories` and machine,
     and on whether `n` exceeds `batch_size`, but not on the number of devices and processes. Each device compiles its
@@ -74,15 +69,17 @@ def monte_carlo(
     Args:
         key: PRNG key of everything random.
         n: Number of pushes.
-        slider: The slider; its surface is the mean of the sampled surfaces.
+        slider: The slider, or a tuple of several; its surface is the mean of the sampled surfaces.
         hand: The hand.
         path: Configurations of the hand, as in `rollout`: (steps + 1, dof), or (n, steps + 1, dof) for a path of each
             push.
-        pose: Pose of the slider at the start, world, m and rad: (3,), or (n, 3) for a start of each push.
+        pose: Pose of the slider at the start, world, m and rad: (3,), or (n, 3) for a start of each push. Of several
+            sliders, (sliders, 3) or (n, sliders, 3).
         model: Distribution from which friction is sampled around `slider.surface`.
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
         fixtures: Walls and bodies that the slider may touch, as in `rollout`; their friction is not random.
+        between: Friction of several sliders with each other, or its range, as in `random_rollout`.
         trajectories: Whether to keep every pose of every push (12 bytes a step in float32), not only the last.
         batch_size: Number of pushes that a device computes at once, in one compiled program. Default 2048 on a
             CPU and 262 144 on an accelerator, or for fewer pushes the next multiple of 64.
@@ -106,25 +103,24 @@ def monte_carlo(
     Reference: Zhou et al. 2017, sections V and VI.
     """
     start_time = time.perf_counter()
-    if traced((key, slider, hand, path, pose, model, table, fixtures)):
+    if traced((key, slider, hand, path, pose, model, table, fixtures, between)):
         raise TypeError(
             "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
         )
     check_count("n", n)
     check_count("batch_size", 1 if batch_size is None else batch_size)
-    check_solver(solver)
     check_type("model", model, FrictionModel)
     words = f"compiling and making {n} pushes"
     with progress_bar(words) if progress is True else nullcontext(progress or no_progress) as report:
-        slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=int(n))
+        *scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures, int(n))
+        slider, hand, path_array, start, table, fixed = scene
         typed_key, used = _typed_key(key), Devices.of(devices)
         default_tile = TILE if used.local[0].platform == "cpu" else ACCELERATOR_TILE
         tile = batch_size or min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         used.gather(0)
-        table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
-        check_start_among_fixtures(slider, fixed, start)
-        setup = Setup(typed_key, model.around(slider.surface), model, slider.shape, hand, solver, table, fixed)
+        distributions = Distributions.of(slider, model, limits)
+        setup = Setup(typed_key, distributions, model, shape_of(slider), hand, solver, table, fixed)
         rounds = Rounds(int(n), int(tile), setup, used, np.asarray(start), np.asarray(path_array), trajectories)
         results = _compute(rounds, slider, checkpoint, report)
     share = float(np.mean(results["shrinkage"] > 0))
@@ -134,9 +130,8 @@ def monte_carlo(
             "origin of the body frame at the center of the pressure, give a larger dof, or use "
             'sampler="sum_of_squares"'
         )
-    starts = np.broadcast_to(rounds.start, (n, 3))
     results.setdefault("trajectory", None)
-    return MonteCarlo(start=starts, **results, seconds=time.perf_counter() - start_time)
+    return MonteCarlo(start=rounds.starts, **results, seconds=time.perf_counter() - start_time)
 
 
 def _typed_key(key: Any) -> PRNGKeyArray:
@@ -150,13 +145,14 @@ def _typed_key(key: Any) -> PRNGKeyArray:
     return typed
 
 
-def _identity(rounds: Rounds, slider: Slider) -> dict[str, Any]:
+def _identity(rounds: Rounds, slider: Slider | tuple[Slider, ...]) -> dict[str, Any]:
     """Return what the bits of a run depend on: its arguments, versions and platform."""
     setup, device = rounds.setup, rounds.devices.local[0]
     key = jax.random.key_data(setup.key), str(jax.random.key_impl(setup.key))
     hand = setup.hand, setup.hand.poses(jnp.asarray(rounds.path))
     arguments = {"key": key, "slider": slider, "hand": hand, "path": rounds.path, "pose": rounds.start}
     arguments |= {name: getattr(setup, name) for name in ("model", "solver", "table", "fixtures")}
+    arguments |= {"between": setup.distributions.between}
     # other instructions or flags of the compiler give other bits; another number of devices does not
     flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag)
     return (
@@ -168,7 +164,9 @@ def _identity(rounds: Rounds, slider: Slider) -> dict[str, Any]:
     )
 
 
-def _compute(rounds: Rounds, slider: Slider, folder: str | Path | None, report: ProgressCallback) -> Results:
+def _compute(
+    rounds: Rounds, slider: Slider | tuple[Slider, ...], folder: str | Path | None, report: ProgressCallback
+) -> Results:
     """Return the results of all pushes; compute those that are not in the checkpoint in `folder`."""
     devices, saved = rounds.devices, None
     parts, done = [], 0

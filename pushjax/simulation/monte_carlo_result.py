@@ -19,8 +19,8 @@ class MonteCarlo:
     last step shows them.
 
     Attributes:
-        start: Poses before the pushes, (n, 3), world, m and rad.
-        pose: Poses after the pushes, (n, 3), world, m and rad.
+        start: Poses before the pushes, (n, 3), world, m and rad; of several sliders, (n, sliders, 3).
+        pose: Poses after the pushes, of the same shape.
         status: `Status` of the last step, (n,).
         mode: `ContactMode` of each contact in the last step, (n, contacts).
         steps_in_mode: Number of steps that each contact was in each `ContactMode`, (n, contacts, 4).
@@ -28,8 +28,10 @@ class MonteCarlo:
         first_failure: Index of the first step that failed, or -1, (n,).
         stopped: Index of the step at which the hand jammed or grasped, or -1, (n,).
         friction: Sampled coefficients of friction mu, (n, draws).
-        shrinkage: How far each sampled quartic was moved toward the mean to be convex, (n, draws).
-        trajectory: All poses, (n, steps + 1, 3), world, m and rad, if they were kept; else None.
+        shrinkage: How far each sampled quartic was moved toward the mean to be convex, (n, draws); of several sliders,
+            the largest.
+        trajectory: All poses, (n, steps + 1, 3), world, m and rad, if they were kept; else None. Of several sliders,
+            (n, steps + 1, sliders, 3).
         seconds: Duration of the run, s, compiling included.
     """
 
@@ -51,7 +53,7 @@ class MonteCarlo:
 
     @property
     def delta(self) -> np.ndarray:
-        """Displacement of the slider in each push, (n, 3), world, m and rad."""
+        """Displacement of each slider in each push, shaped as `pose`, world, m and rad."""
         return self.pose - self.start
 
     def outcomes(self) -> dict[str, int]:
@@ -80,7 +82,10 @@ class MonteCarlo:
         return {"edges": edges, "counts": counts}
 
     def summary(self) -> dict[str, Any]:
-        """Summarize the run in plain numbers, by name: counts, fractions, moments and quantiles."""
+        """Summarize the run in plain numbers, by name: counts, fractions, moments and quantiles.
+
+        Of several sliders, "pose" is a list.
+        """
         in_mode = self.steps_in_mode.sum(axis=0, dtype=np.int64)
         shares = in_mode / np.maximum(in_mode.sum(axis=1, keepdims=True), 1)
         statuses, counts = np.unique(self.status, return_counts=True)
@@ -93,10 +98,7 @@ class MonteCarlo:
                 {mode.name: float(share) for mode, share in zip(ContactMode, contact, strict=True)}
                 for contact in shares
             ],
-            "pose": {
-                name: _moments(values) | {"quantiles": {str(q): float(np.quantile(values, q)) for q in QUANTILES}}
-                for name, values in zip(COORDINATES, np.asarray(self.pose, np.float64).T, strict=True)
-            },
+            "pose": _of_poses(self.pose) if self.pose.ndim == 2 else [_of_poses(p) for p in self.pose.swapaxes(0, 1)],
             "friction": _moments(self.friction),
             "repaired": {
                 "share": float(repaired.mean()),
@@ -104,6 +106,14 @@ class MonteCarlo:
             },
             "seconds": self.seconds,
         }
+
+
+def _of_poses(poses: np.ndarray) -> dict[str, Any]:
+    """Return moments and quantiles of each coordinate of poses (n, 3)."""
+    return {
+        name: _moments(values) | {"quantiles": {str(q): float(np.quantile(values, q)) for q in QUANTILES}}
+        for name, values in zip(COORDINATES, np.asarray(poses, np.float64).T, strict=True)
+    }
 
 
 def _moments(values: np.ndarray) -> dict[str, float]:

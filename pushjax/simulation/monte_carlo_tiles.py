@@ -26,13 +26,12 @@ from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.status import ContactMode
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.friction_model import FrictionModel
-from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.checkpoint import CheckpointError
 from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.random_rollout import Draws, draw, rollout_under_draws
+from pushjax.simulation.random_rollout import Distributions, Draws, draw, rollout_under_draws
 
 Results = dict[str, Any]  # of pushes: the fields of `MonteCarlo` by name, also the arrays in a checkpoint
 
@@ -41,9 +40,9 @@ class Setup(NamedTuple):
     """What all pushes share."""
 
     key: Array
-    surfaces: SurfaceDistribution
+    distributions: Distributions
     model: FrictionModel
-    shape: Shape  # of the slider
+    shape: Shape | tuple[Shape, ...]  # of the slider, or of several
     hand: Hand
     solver: ContactSolver | StickingSolver | None  # None for the default
     table: Table | None  # None for uniform friction
@@ -94,9 +93,15 @@ class Rounds:
     tile: int
     setup: Setup
     devices: Devices
-    start: np.ndarray  # pose of the slider, (3,) or (n, 3), world, m and rad
+    start: np.ndarray  # pose of each slider, of all pushes or with an axis for them, world, m and rad
     path: np.ndarray  # (steps + 1, dof) or (n, steps + 1, dof)
     keep_trajectories: bool
+
+    @property
+    def starts(self) -> np.ndarray:
+        """The start of each push, (n, 3), or (n, sliders, 3) of several sliders."""
+        shape = self.setup.shape
+        return np.broadcast_to(self.start, (self.n, *((len(shape),) if isinstance(shape, tuple) else ()), 3))
 
     def compute(self, begin: int) -> Iterator[tuple[int, Results]]:
         """Yield the results of each round from push `begin` on, after the index at which the round ends."""
@@ -122,11 +127,13 @@ class Rounds:
         processes, rank = self.devices.processes, self.devices.rank
         pushes = np.arange(processes * len(setups) * self.tile, dtype=np.uint32).reshape(processes, -1, self.tile)
         index = np.minimum(first + pushes[rank], self.n - 1)  # (devices, tile); the last round repeats its last push
-        poses = np.broadcast_to(self.start, (self.n, 3))[index]
+        poses = self.starts[index]
         # a path that all pushes share is sent once to each device
         paths = [self.path] * len(setups) if self.path.ndim == 2 else self.path[index]
         steps = self.path.shape[-2] - 1
-        draw_args = [(steps, setup.key, setup.surfaces, setup.model, i) for setup, i in zip(setups, index, strict=True)]
+        draw_args = [
+            (steps, each.key, each.distributions, each.model, i) for each, i in zip(setups, index, strict=True)
+        ]
         shapes = draw_tile.eval_shape(*draw_args[0])
         # In parallel, because each device compiles its own programs, once. XLA compiles without Python's lock, and JAX
         # keeps what is traced here for the calls that follow.
@@ -137,9 +144,9 @@ class Rounds:
         return list(pool.map(partial(push_there, self.keep_trajectories), setups, draws, paths, poses))
 
 
-def _draw_tile(steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array) -> Draws:
+def _draw_tile(steps: int, key: Array, distributions: Distributions, model: FrictionModel, index: Array) -> Draws:
     """Sample the friction of each push of a tile; `index` has the indices of the pushes, (tile,)."""
-    return jax.vmap(lambda i: draw(jax.random.fold_in(key, i), surfaces, model, steps))(index)
+    return jax.vmap(lambda i: draw(jax.random.fold_in(key, i), distributions, model, steps))(index)
 
 
 def _push_tile(keep_trajectories: bool, setup: Setup, draws: Draws, paths: Array, poses: Array) -> Results:

@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, check_key, check_type
+from pushjax._internal.checks import ArrayLike, as_float, check_key, check_type, concrete
 from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import entry_at
-from pushjax.contact.problem import check_solver, form_and_friction
+from pushjax.contact.problem import form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.friction_model import FrictionModel
@@ -18,15 +19,11 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import (
-    check_start_among_fixtures,
-    checked_fixtures,
-    checked_rollout_arguments,
-    checked_table,
-)
+from pushjax.simulation.arguments import checked_scene
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import friction_on_table, simulate
+from pushjax.simulation.several_sliders import SlidersFriction, simulate_sliders
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
@@ -35,14 +32,17 @@ class Draws(NamedTuple):
     """Friction that was sampled for a push.
 
     Attributes:
-        surface: Limit surfaces, with a leading axis of draws.
+        surface: Limit surfaces, with a leading axis of draws; of several sliders, a tuple of them.
         friction: Coefficients of friction mu, (draws,).
-        shrinkage: How far each surface was moved toward the mean to be convex, (draws,); as in `SurfaceSample`.
+        shrinkage: How far each surface was moved toward the mean to be convex, (draws,); as in `SurfaceSample`. Of
+            several sliders, the largest.
+        between: Coefficients of friction of several sliders with each other, (draws, sliders, sliders); else None.
     """
 
-    surface: LimitSurface
+    surface: LimitSurface | tuple[LimitSurface, ...]
     friction: Float[Array, "draws"]
     shrinkage: Float[Array, "draws"]
+    between: Float[Array, "draws sliders sliders"] | None = None
 
 
 class RandomRollout(NamedTuple):
@@ -57,13 +57,38 @@ class RandomRollout(NamedTuple):
     draws: Draws
 
 
-def draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel, steps: int) -> Draws:
+class Distributions(NamedTuple):
+    """What the friction of a push is sampled from, besides the model."""
+
+    surfaces: SurfaceDistribution | tuple[SurfaceDistribution, ...]
+    between: Array | None  # lowest and highest friction of several sliders with each other, (2, sliders, sliders)
+
+    @staticmethod
+    def of(slider: Slider | tuple[Slider, ...], model: FrictionModel, between: Array | None) -> "Distributions":
+        """The distributions around the limit surfaces of one slider, or of several."""
+        if isinstance(slider, Slider):
+            return Distributions(model.around(slider.surface), None)
+        return Distributions(tuple(model.around(one.surface) for one in slider), between)
+
+
+def draw(key: PRNGKeyArray, distributions: Distributions, model: FrictionModel, steps: int) -> Draws:
     """Sample the friction of one push of `steps` steps."""
+    surfaces, between = distributions
 
     def sample_once(key):
         surface_key, friction_key = jax.random.split(key)
-        sample = surfaces.sample(surface_key)
-        return Draws(sample.surface, model.sample_friction(friction_key), sample.shrinkage)
+        if not isinstance(surfaces, tuple):
+            sample = surfaces.sample(surface_key)
+            return Draws(sample.surface, model.sample_friction(friction_key), sample.shrinkage)
+        keys = jax.random.split(surface_key, len(surfaces))
+        samples = [one.sample(own) for one, own in zip(surfaces, keys, strict=True)]
+        (low, high), mutual_key = between, jax.random.fold_in(friction_key, 1)
+        return Draws(
+            tuple(sample.surface for sample in samples),
+            model.sample_friction(friction_key),
+            jnp.max(jnp.stack([sample.shrinkage for sample in samples])),
+            low + (high - low) * jax.random.uniform(mutual_key, (), low.dtype),
+        )
 
     # a single draw equals `model.sample(key, surface)`
     if model.resample_every is None:
@@ -74,7 +99,7 @@ def draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel,
 
 def rollout_under_draws(
     draws: Draws,
-    shape: Shape,
+    shape: Shape | tuple[Shape, ...],
     hand: Hand,
     path: Array,
     pose: Array,
@@ -85,19 +110,25 @@ def rollout_under_draws(
 ) -> Trajectory:
     """Return a push under friction that was sampled before."""
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
-    surfaces_and_frictions = jax.vmap(form_and_friction)(draws.surface, friction.astype(pose.dtype))
+    friction = friction.astype(pose.dtype)
+    if isinstance(shape, tuple):
+        all_draws = jax.vmap(SlidersFriction.of)(draws.surface, friction, draws.between)
+    else:
+        all_draws = jax.vmap(form_and_friction)(draws.surface, friction)
 
-    first_draw = entry_at(surfaces_and_frictions, 0)
+    first_draw = entry_at(all_draws, 0)
 
-    def friction_at(step, pose):
-        return first_draw if resample_every is None else entry_at(surfaces_and_frictions, step // resample_every)
+    def friction_at(step, pose=None):
+        return first_draw if resample_every is None else entry_at(all_draws, step // resample_every)
 
+    if isinstance(shape, tuple):
+        return simulate_sliders(shape, hand, path, pose, friction_at, fixtures)
     return simulate(shape, hand, path, pose, solver, friction_on_table(table, friction_at), fixtures)
 
 
 def random_rollout(
     key: PRNGKeyArray,
-    slider: Slider,
+    slider: Slider | Sequence[Slider],
     hand: Hand,
     path: ArrayLike,
     *,
@@ -106,8 +137,9 @@ def random_rollout(
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
     fixtures: Sequence[Wall | Fixture] = (),
+    between: ArrayLike | None = None,
 ) -> RandomRollout:
-    """Push the slider along a path under friction sampled from `model` around the slider's surface.
+    """Push the slider, or several, along a path under friction sampled from `model` around the surface of each.
 
     The result is differentiable like a `rollout`, and also in the range of the model's friction and in its `dof`.
     Derivatives in `dof` are correct in the mean over keys. For a single key they are not, because its sample jumps.
@@ -117,14 +149,16 @@ def random_rollout(
 
     Args:
         key: PRNG key of everything random.
-        slider: The slider; its surface is the mean of the sampled surfaces.
+        slider: The slider, or a tuple of several; its surface is the mean of the sampled surfaces.
         hand: The hand.
         path: Configurations of the hand, as in `rollout`.
-        pose: Pose of the slider at the start, (3,), world, m and rad.
+        pose: Pose of the slider at the start, (3,), world, m and rad; of several, (sliders, 3).
         model: Distribution of limit surface and friction.
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
         fixtures: Walls and bodies that the slider may touch, as in `rollout`; their friction is not random.
+        between: Coefficient of friction of several sliders with each other, as in `rollout`, or the range (lowest,
+            highest), shape (2,), from which it is sampled, one for all.
 
     Returns:
         The push, and the friction that was sampled for it.
@@ -137,19 +171,37 @@ def random_rollout(
     Reference: Zhou et al. 2017, section V.
     """
     check_key(key)
-    check_solver(solver)
     check_type("model", model, FrictionModel)
-    slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0)
-    table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
-    check_start_among_fixtures(slider, fixed, start)
-    return _random_rollout(
-        key, model.around(slider.surface), slider.shape, hand, path_array, start, model, solver, table, fixed
-    )
+    *scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures)
+    slider, hand, path_array, start, table, fixed = scene
+    distributions, shape = Distributions.of(slider, model, limits), shape_of(slider)
+    return _random_rollout(key, distributions, shape, hand, path_array, start, model, solver, table, fixed)
+
+
+def checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures, pushes=None):
+    """Return slider or sliders, hand, path, start, table, fixtures, and the limits of the friction between sliders."""
+    is_range = between is not None and np.shape(between) == (2,)
+    low, high = between if is_range else (between, between)
+    rest = solver, table, fixtures, pushes
+    *scene, friction, table, fixed = checked_scene(slider, hand, path, pose, 0.0, high, *rest)
+    if not isinstance(scene[0], tuple):
+        return *scene, table, fixed, None
+    if is_range:
+        least, most = (concrete(as_float(value, name="between")) for value in (low, high))
+        if least is not None and most is not None and not 0 <= least <= most:
+            raise ValueError(f"between must be (lowest, highest), not negative; got ({least:g}, {most:g})")
+    lowest = jnp.broadcast_to(as_float(low, friction[1].dtype, "between"), friction[1].shape)
+    return *scene, table, fixed, jnp.stack([lowest, friction[1]])
+
+
+def shape_of(slider: Slider | tuple[Slider, ...]) -> Shape | tuple[Shape, ...]:
+    """Return the outline of one slider, or of each of several."""
+    return slider.shape if isinstance(slider, Slider) else tuple(one.shape for one in slider)
 
 
 @quick_jit
-def _random_rollout(key, surfaces, shape, hand, path, pose, model, solver, table, fixtures) -> RandomRollout:
-    draws = draw(key, surfaces, model, len(path) - 1)
+def _random_rollout(key, distributions, shape, hand, path, pose, model, solver, table, fixtures) -> RandomRollout:
+    draws = draw(key, distributions, model, len(path) - 1)
     return RandomRollout(
         rollout_under_draws(draws, shape, hand, path, pose, solver, model.resample_every, table, fixtures), draws
     )

@@ -23,17 +23,15 @@ from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
-from pushjax.friction.feet import Feet
+from pushjax.friction.feet import FeetForm
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.table import Table, TransformedForm
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.arguments import (
     check_opening,
-    check_start_among_fixtures,
     checked_arguments,
     checked_fixtures,
-    checked_rollout_arguments,
-    checked_sliders_arguments,
+    checked_scene,
     checked_table,
     warn_about_units,
 )
@@ -42,7 +40,7 @@ from pushjax.simulation.domain import poses_are_moderate
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.prepared_push import FrictionAt, prepared_push
-from pushjax.simulation.several_sliders import simulate_sliders
+from pushjax.simulation.several_sliders import SlidersFriction, simulate_sliders
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.substeps import simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, trajectory_of
@@ -101,7 +99,7 @@ def step(
 
 @quick_jit
 def _step(slider, hand, q0, q1, pose, friction, solver, table, fixtures) -> Step:
-    push = _simulate_one(slider, hand, jnp.stack([q0, q1]), pose, friction, solver, table, fixtures)
+    push = _simulated(slider, hand, jnp.stack([q0, q1]), pose, friction, solver, table, fixtures)
     fields = {name: getattr(push, name)[-1] for name in Step.__dataclass_fields__}
     return Step(**fields)
 
@@ -166,40 +164,22 @@ def rollout(
     Reference: Zhou et al. 2017, section IV.A, and open problem 2 of section VII. The header of
     `pushjax.simulation.step` has the scheme.
     """
-    check_solver(solver)
-    if isinstance(slider, tuple | list):
-        if solver is not None or table is not None:
-            raise ValueError("solver and table are for one slider; got one with several sliders")
-        sliders, hand, path_array, start, mu = checked_sliders_arguments(slider, hand, path, pose, friction, between)
-    else:
-        if between is not None:
-            raise ValueError("between is for several sliders; got one")
-        sliders, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
-    fixed = checked_fixtures(fixtures, start.dtype)
-    several = sliders if isinstance(sliders, tuple) else (sliders,)
-    for one, its_start in zip(several, start.reshape(-1, 3), strict=True):
-        check_start_among_fixtures(one, fixed, its_start)
-    checked = sliders, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed
+    scene = checked_scene(slider, hand, path, pose, friction, between, solver, table, fixtures)
+    checked = *scene[:5], solver, *scene[5:]
     return _rollout(*checked) if is_staging() else _rollout_with_padding(*checked)
 
 
-@quick_jit
-def _rollout(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
+def _simulated(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
     if isinstance(slider, tuple):
-        return simulate_sliders(slider, hand, path, pose, friction[0], friction[1], fixtures, num_steps)
-    return _simulate_one(slider, hand, path, pose, friction, solver, table, fixtures, num_steps)
-
-
-def _simulate_one(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
-    """Roll out a path of one slider, by the solver for several if its limit surface is no polynomial."""
-    if isinstance(slider.surface, Feet) and solver is None and table is None:
-        alone = jnp.zeros((1, 1), pose.dtype)
-        push = simulate_sliders((slider,), hand, path, pose[None], friction, alone, fixtures, num_steps)
-        of_slider = {name: getattr(push, name)[:, 0] for name in ("pose", "twist", "wrench")}
-        return dataclasses.replace(push, **of_slider)
+        constant = SlidersFriction.of(tuple(one.surface for one in slider), *friction)
+        shapes = tuple(one.shape for one in slider)
+        return simulate_sliders(shapes, hand, path, pose, lambda step: constant, fixtures, num_steps)
     uniform = form_and_friction(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
     return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures, num_steps)
+
+
+_rollout = quick_jit(_simulated)
 
 
 def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
@@ -217,9 +197,8 @@ def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
 def _first_steps(push: Trajectory, steps: int) -> Trajectory:
     """Return the first steps of a push."""
     extra = {"pose": 1, "configuration": 1}  # these have one row more than there are steps, the start
-    return Trajectory(
-        **{name: getattr(push, name)[: steps + extra.get(name, 0)] for name in Trajectory.__dataclass_fields__}
-    )
+    arrays = [name for name in Trajectory.__dataclass_fields__ if name != "contacts"]
+    return dataclasses.replace(push, **{name: getattr(push, name)[: steps + extra.get(name, 0)] for name in arrays})
 
 
 def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
@@ -247,12 +226,26 @@ def simulate(
     num_steps: Array | None = None,  # steps to simulate; None for all. The rest of the result has no meaning
 ) -> Trajectory:
     """Roll out a path, with arguments that have been checked. `rollout` is the public function."""
+    first_form = friction_at(jnp.zeros((), jnp.int32), Vec3.of(pose))[0]
+    if isinstance(first_form, FeetForm) and solver is None:
+
+        def alone_at(step: Array) -> SlidersFriction:
+            form, mu = friction_at(step, Vec3.of(pose))
+            return SlidersFriction((form,), mu, jnp.zeros((1, 1), pose.dtype))
+
+        push = simulate_sliders((shape,), hand, path, pose[None], alone_at, fixtures, num_steps)
+        of_slider = {name: getattr(push, name)[:, 0] for name in ("pose", "twist", "wrench")}
+        return dataclasses.replace(push, **of_slider)
     push, first_pose = prepared_push(shape, hand, path, pose, solver, friction_at, fixtures)
     push, start = push._replace(num_steps=num_steps), Vec3.of(first_pose)
-    if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
+    sizes = [num_contacts(body, push.outline) for body in (*hand.fingers, *(each.finger for each in push.fixtures))]
+    others = [f"finger {k}" for k in range(len(hand.fingers))] + [f"fixture {k}" for k in range(len(fixtures))]
+    contacts = tuple(("slider 0", name) for name, size in zip(others, sizes, strict=True) for _ in range(size))
+    if len(contacts) == 1:
         records = simulate_in_whole_steps(push, start)
         fraction = jnp.zeros_like(start.x)
     else:
         records, fraction = simulate_in_substeps(push, start)
     length = push.friction_at(jnp.zeros((), jnp.int32), start)[0].length
-    return trajectory_of(records, length, path, first_pose, fraction, pose, poses_are_moderate(pose, length))
+    valid = poses_are_moderate(pose, length)
+    return trajectory_of(records, length, path, first_pose, fraction, pose, valid, contacts)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
@@ -25,7 +26,7 @@ from pushjax.simulation.candidate import Features, Touches, joined
 from pushjax.simulation.detection import num_contacts
 from pushjax.simulation.finger_motion import BodyFrame, FingerMotion, max_penetration
 from pushjax.simulation.fixtures import Wall
-from pushjax.simulation.hand import Finger
+from pushjax.simulation.hand import Finger, Pad, RoundFinger
 from pushjax.simulation.impact import time_of_impact
 from pushjax.simulation.step import (
     MAX_ROTATION_PER_STEP,
@@ -44,6 +45,17 @@ class Body(NamedTuple):
     finger: Finger | None  # None for a slider that is not convex, which cannot push another one that is not either
     center: Vec2  # of the finger, in the frame of the slider, m
     friction: Scalar  # with each slider, (sliders,)
+
+    @staticmethod
+    def of(shape: Shape, friction: Array) -> "Body":
+        """A slider of this shape."""
+        zero = jnp.zeros_like(jax.tree.leaves(shape)[0].ravel()[0])
+        finger, center = None, Vec2(zero, zero)
+        if isinstance(shape, Disk):
+            finger, center = RoundFinger(shape.radius), Vec2.of(shape.center)
+        elif isinstance(shape, Polygon) and can_push(shape):
+            finger = Pad(shape)
+        return Body(shape.outline(), finger, center, friction)
 
     def as_finger(self, frame: BodyFrame, other: int) -> FingerMotion:
         """Return the slider as a finger of another one that stays where it is."""
@@ -129,6 +141,18 @@ def depth_of_sliders(bodies: tuple[Body, ...], meetings: list[Meeting], pose: Ve
         for m in meetings
     ]
     return functools.reduce(jnp.maximum, depths)
+
+
+@quick_jit
+def mutual_overlaps(shapes: tuple[Shape, ...], poses: Array) -> Array:
+    """Return the depth of each pair of sliders in each other, m, for each of many poses (pushes, sliders, 3), world."""
+    bodies = tuple(Body.of(shape, jnp.zeros(len(shapes), poses.dtype)) for shape in shapes)
+    pairs = meetings_of(bodies, (), ())
+
+    def depths_of(pose: Array) -> Array:
+        return jnp.stack([depth_of_sliders(bodies, [pair], Vec3.of(pose.T), 0.0) for pair in pairs])
+
+    return jax.vmap(depths_of)(poses)
 
 
 class _PushingPart(NamedTuple):

@@ -76,6 +76,8 @@ class Trajectory(eqx.Module):
         mode: `ContactMode` of each contact, (steps, contacts).
         status: `Status` of each step, (steps,).
         overlap: Depth of the deepest finger or fixture in the slider after each step, (steps,), m. Not differentiated.
+        contacts: The two bodies of each contact, by kind and number, such as ("slider 0", "finger 1"). Point and normal
+            are in the frame of the first one.
     """
 
     pose: Float[Array, "steps+1 3"]
@@ -88,6 +90,7 @@ class Trajectory(eqx.Module):
     mode: Int[Array, "steps contacts"]
     status: Int[Array, "steps"]
     overlap: Float[Array, "steps"]
+    contacts: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
 
     @property
     def failed(self) -> Bool[Array, "steps"]:
@@ -133,6 +136,7 @@ def trajectory_of(
     fraction: Scalar,  # of the last step that a stopped hand did
     pose: Float[Array, "*sliders 3"],  # that was given
     valid: Bool[Array, ""],  # whether this pose is one that can be computed with
+    contacts: tuple[tuple[str, str], ...],
 ) -> Trajectory:
     """Return the records of all steps as a trajectory."""
     results, steps = to_arrays(records, length), len(path) - 1
@@ -146,4 +150,4 @@ def trajectory_of(
     poses = jnp.concatenate([first_pose[None], results.pose])
     poses = jnp.where(valid, poses, jnp.broadcast_to(pose, poses.shape))
     other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
-    return Trajectory(pose=poses, configuration=configuration, **other_fields)
+    return Trajectory(pose=poses, configuration=configuration, contacts=contacts, **other_fields)
