@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.checks import ArrayLike, concrete
+from pushjax._internal.checks import ArrayLike, checked_array, concrete
 from pushjax._math.arrays import ENTRIES
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3
@@ -59,29 +59,30 @@ class Feet(LimitSurface):
     Attributes:
         point: Support points in the body frame, shape (points, 2), m.
         limit: Largest friction force at each point, shape (points,), N.
+        length: Length that normalizes torques, m. Default: the radius of gyration of the support.
 
     Raises:
-        ValueError: As `Support`; also if all loads are on one point.
+        ValueError: As `Support`; also if all loads are on one point, or if the length is not positive.
 
     Reference: Goyal, Ruina & Papadopoulos 1991.
     """
 
     point: Float[Array, "points 2"]
     limit: Float[Array, "points"]
+    length: Float[Array, ""]
     degree: ClassVar[int] = 1
 
-    def __init__(self, point: ArrayLike, limit: ArrayLike):
+    def __init__(self, point: ArrayLike, limit: ArrayLike, length: ArrayLike | None = None):
         support = Support(point, limit)
         self.point, self.limit = support.point, support.limit
         known_point, known_limit = concrete(self.point), concrete(self.limit)
         if known_point is not None and known_limit is not None:
             if len(np.unique(known_point[known_limit > 0], axis=0)) < 2:
                 raise ValueError(f"point: all loads are on one point; got limits {known_limit.tolist()}")
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """The radius of gyration of the support, m."""
-        return Support(self.point, self.limit).radius_of_gyration
+        gyration = support.radius_of_gyration if length is None else length
+        if concrete(gyration) is not None:
+            gyration = checked_array("length", gyration, (), self.point.dtype, positive=True)
+        self.length = jnp.asarray(gyration, self.point.dtype)
 
     def form(self) -> FeetForm:
         length = self.length

@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.jit import quick_jit
-from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.quartic import Quartic
 from pushjax.friction.table import Table
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2 import compose, inverse, transform
@@ -170,8 +168,8 @@ def _direction_residual(free: dict[str, Array], parameters: Parameters, surface:
 
 
 def coefficients_of(surface: LimitSurface) -> Array:
-    """Return the array of the surface that is estimated: coefficients (15,) of a quartic, A (3, 3) of an ellipsoid."""
-    return getattr(surface, "coefficients" if surface.degree == 4 else "A")
+    """Return what is estimated: coefficients (15,) of a quartic, A (3, 3) of an ellipsoid, limits of support points."""
+    return getattr(surface, {1: "limit", 2: "A", 4: "coefficients"}[surface.degree])
 
 
 def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurface:
@@ -272,5 +270,4 @@ def _change_per_length(path: Array, travel: Array, first: int, last: int) -> Flo
 
 def limit_surfaces(prior: Prior, parameters: Parameters) -> LimitSurface:
     """Return the limit surfaces of all conditions, with a leading axis of conditions."""
-    surface_type = Quartic if prior.mean_surface.factors.shape[1] > 1 else Ellipsoid
-    return jax.vmap(surface_type)(parameters.surface, prior.mean_surface.length)
+    return jax.vmap(lambda mean, coefficients: mean.surface(coefficients))(prior.mean_surface, parameters.surface)

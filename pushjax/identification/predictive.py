@@ -10,6 +10,7 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.jit import jit
+from pushjax.friction.feet import Feet
 from pushjax.friction.friction_model import FrictionModel, Sampler
 from pushjax.friction.quartic import Quartic
 from pushjax.friction.surface_distributions import SumOfSquaresQuartic, SurfaceDistribution
@@ -85,7 +86,9 @@ class PredictiveModel(eqx.Module):
     def of(found: Identified, pushes: Pushes, slider: Slider, hand: Hand, sampler: Sampler) -> "PredictiveModel":
         """Prepare the prediction of `pushes` from what was identified."""
         parameters = found.prior.parameters(found.z)
-        surfaces, factors = limit_surfaces(found.prior, parameters), found.prior.factors(found.z)
+        surfaces = limit_surfaces(found.prior, parameters)
+        # of exact support points there are none
+        factors = surfaces.length if isinstance(surfaces, Feet) else found.prior.factors(found.z)
         model, dof = FrictionModel(PLACEHOLDER_DOF, 0.0, sampler), jnp.asarray(PLACEHOLDER_DOF, found.z.dtype)
 
         def around(surface, factors) -> SurfaceDistribution:

@@ -9,7 +9,8 @@ surface          H(F) = sum_k (F' P_k F)^(d/2), P_k = L_k L_k', L_k = L0_k (1 + 
                  ellipsoid, which has one term, and 4 for a quartic. L0_k belongs to the mean surface. E_k is lower
                  triangular, with variance 1 / m below the diagonal and 1 / (2 m) on it. To first order, for many
                  degrees of freedom m, this is the distribution from which `FrictionModel` draws ("sum_of_squares"),
-                 with the same meaning of dof. H is always convex.
+                 with the same meaning of dof. H is always convex. Of exact support points, the friction limit of each
+                 is exp(e) times its mean, e with variance 2 / m.
 pressure_center  center of pressure c, about which the torque of the surface is taken: H(fx, fy, tau - c x f).
 the rest         see `Unknowns`: entries of z times their standard deviation.
 """
@@ -21,9 +22,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax.friction.ellipsoid import Ellipsoid
+from pushjax.friction.feet import Feet
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.quartic import Quartic
-from pushjax.friction.sum_of_squares import TERMS, decompose, squared_quadratics, unpack_lower
+from pushjax.friction.sum_of_squares import decompose, squared_quadratics, unpack_lower
 from pushjax.friction.surface_distributions import dof_of_terms
 from pushjax.identification.unknowns import SIZES, Parameters, Unknowns
 
@@ -42,9 +44,9 @@ class Layout(eqx.Module):
     conditions: int = eqx.field(static=True)  # number of conditions
 
     @staticmethod
-    def of(unknowns: Unknowns, degree: int, conditions: int) -> "Layout":
-        """Return the layout for surfaces of degree 2 or 4."""
-        sizes = SIZES | {"surface": 6 * (TERMS if degree == 4 else 1), "friction_by_side": unknowns.sides}
+    def of(unknowns: Unknowns, surface_entries: int, conditions: int) -> "Layout":
+        """Return the layout for surfaces with this number of entries."""
+        sizes = SIZES | {"surface": surface_entries, "friction_by_side": unknowns.sides}
         names = unknowns.names
         return Layout(names, tuple(sizes[name] for name in names), unknowns.shared, conditions)
 
@@ -98,6 +100,29 @@ class PriorSurface(eqx.Module):
     relative_std: Float[Array, "conditions"]
     length: Float[Array, "conditions"]  # m
 
+    @property
+    def entries(self) -> int:
+        """Number of entries of z for each condition."""
+        return 6 * self.factors.shape[1]
+
+    def perturbed(self, entries: Array) -> Array:
+        """The factors of one condition."""
+        return self.factors + self.relative_std * self.factors @ _unit_perturbation(entries.reshape(-1, 6))
+
+    @property
+    def parameters(self) -> Array:
+        """What `perturbed` changes."""
+        return self.factors
+
+    def coefficients(self, factors: Array) -> Array:
+        """The coefficients of a limit surface of one condition."""
+        gram = factors @ jnp.swapaxes(factors, 1, 2)
+        return squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
+
+    def surface(self, coefficients: Array) -> LimitSurface:
+        """The limit surface of one condition."""
+        return (Quartic if self.factors.shape[0] > 1 else Ellipsoid)(coefficients, self.length)
+
     @staticmethod
     def of(surface: LimitSurface, dof: Array | None) -> "PriorSurface":
         """Return the prior for mean surfaces with a leading axis of conditions; `dof` None: the surface is known."""
@@ -111,13 +136,50 @@ class PriorSurface(eqx.Module):
         return PriorSurface(factors, jnp.broadcast_to(1 / jnp.sqrt(term_dof), surface.length.shape), surface.length)
 
 
+class PriorFeet(eqx.Module):
+    """The mean support points of every condition, from which identification starts."""
+
+    point: Float[Array, "conditions points 2"]
+    limit: Float[Array, "conditions points"]
+    relative_std: Float[Array, "conditions"]  # of a limit; zero if they are known
+    length: Float[Array, "conditions"]  # m
+
+    @property
+    def entries(self) -> int:
+        """Number of entries of z for each condition."""
+        return self.limit.shape[1]
+
+    def perturbed(self, entries: Array) -> Array:
+        """The friction limits of one condition."""
+        return self.limit * jnp.exp(self.relative_std * entries)
+
+    @property
+    def parameters(self) -> Array:
+        """What `perturbed` changes."""
+        return self.limit
+
+    def coefficients(self, limit: Array) -> Array:
+        """As given: the friction limits are what is estimated."""
+        return limit
+
+    def surface(self, limit: Array) -> LimitSurface:
+        """The limit surface of one condition."""
+        return Feet(self.point, limit, self.length)
+
+    @staticmethod
+    def of(surface: Feet, dof: Array | None) -> "PriorFeet":
+        """Return the prior for mean surfaces with a leading axis of conditions; `dof` None: the surface is known."""
+        std = jnp.zeros((), surface.limit.dtype) if dof is None else jnp.sqrt(2 / dof).astype(surface.limit.dtype)
+        return PriorFeet(surface.point, surface.limit, jnp.broadcast_to(std, surface.length.shape), surface.length)
+
+
 def _factors_of(surface: LimitSurface) -> Array:
     """Return the factors L_k of a surface, (terms, 3, 3)."""
     if isinstance(surface, Quartic):
         return decompose(surface.coefficients).lower
     if isinstance(surface, Ellipsoid):
         return jnp.linalg.cholesky(surface.A)[None]
-    raise TypeError(f"surface: expected an Ellipsoid or a Quartic; got a {type(surface).__name__}")
+    raise TypeError(f"surface: expected an Ellipsoid, a Quartic or Feet; got a {type(surface).__name__}")
 
 
 class Prior(eqx.Module):
@@ -127,44 +189,45 @@ class Prior(eqx.Module):
     # Known parameters by name, with a leading axis of conditions, in the units of `Parameters`. The friction is always
     # among them, and is used unless it is estimated.
     known: dict[str, Array]
-    mean_surface: PriorSurface  # with a leading axis of conditions
+    mean_surface: PriorSurface | PriorFeet  # with a leading axis of conditions
     origin: Float[Array, "2"]  # world, m, reference point of the table friction
     layout: Layout = eqx.field(static=True)
 
     @staticmethod
     def of(unknowns: Unknowns, surface: LimitSurface, known: dict[str, Array], origin: Array) -> "Prior":
         """Return the prior for surfaces and known parameters with a leading axis of conditions."""
-        layout = Layout.of(unknowns, surface.degree, surface.length.shape[0])
-        return Prior(unknowns, known, PriorSurface.of(surface, unknowns.surface_dof), origin, layout)
+        mean = (PriorFeet if isinstance(surface, Feet) else PriorSurface).of(surface, unknowns.surface_dof)
+        if isinstance(mean, PriorFeet) and ("pressure_center" in unknowns.names or "pressure_center" in known):
+            raise ValueError("pressure_center: of exact support points, the friction limits determine it; leave it out")
+        return Prior(unknowns, known, mean, origin, Layout.of(unknowns, mean.entries, len(mean.length)))
 
     def parameters(self, z: Float[Array, "size"]) -> Parameters:
         """Return the physical parameters of every condition."""
 
         def of_condition(*condition) -> Parameters:
             values, factors = self._values_and_factors(*condition)
-            gram = factors @ jnp.swapaxes(factors, 1, 2)
-            surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
-            zeros = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), gram.dtype) for name in ALWAYS_PRESENT}
+            surface = condition[-1].coefficients(factors)
+            zeros = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), z.dtype) for name in ALWAYS_PRESENT}
             return Parameters(surface=surface, **(zeros | values))
 
         return jax.vmap(of_condition)(z[self.layout.positions], self.known, self.mean_surface)
 
     def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
-        """Return the lower triangular factors L_k of every condition's surface."""
+        """Return the lower triangular factors L_k of every condition's surface, which is a polynomial."""
         conditions = z[self.layout.positions], self.known, self.mean_surface
         full = jax.vmap(lambda *condition: self._values_and_factors(*condition)[1])(*conditions)
         # an unknown center of pressure makes them full; the QR decomposition makes them triangular again
         return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(full, -1, -2), mode="r"), -1, -2)
 
     def _values_and_factors(
-        self, z: Array, known: dict[str, Array], mean: PriorSurface
-    ) -> tuple[dict[str, Array], Float[Array, "terms 3 3"]]:
-        """Return the parameters of one condition by name, and its surface as factors L_k that may be full."""
-        values, factors = dict(known), mean.factors
+        self, z: Array, known: dict[str, Array], mean: PriorSurface | PriorFeet
+    ) -> tuple[dict[str, Array], Array]:
+        """Return the parameters of one condition by name, and its surface: factors L_k that may be full, or limits."""
+        values, factors = dict(known), mean.parameters
         for name, where in self.layout.slices.items():
             entries = z[where]
             if name == "surface":
-                factors = factors + mean.relative_std * factors @ _unit_perturbation(entries.reshape(-1, 6))
+                factors = mean.perturbed(entries)
                 continue
             prior = getattr(self.unknowns, name).astype(z.dtype)
             if name == "friction":

@@ -15,7 +15,7 @@ from pushjax._internal.files import load_json, save_json, to_list
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.identification import uncertainty
 from pushjax.identification.model import Scene, apply_inset, correct_path, limit_surfaces, predict_pushes
-from pushjax.identification.prior import Layout, Prior, PriorSurface
+from pushjax.identification.prior import Layout, Prior, PriorFeet, PriorSurface
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.unknowns import NORMAL_PRIORS, Parameters, Unknowns, known_parameters
 from pushjax.simulation.hand import Hand
@@ -299,7 +299,7 @@ def to_record(found: Identified) -> dict[str, Any]:
     }
     record |= {"sides": unknowns.sides, "shared": unknowns.shared, "origin": to_list(found.prior.origin)}
     record["known"] = {name: to_list(value) for name, value in found.prior.known.items()}
-    record["mean_surface"] = {name: to_list(getattr(mean, name)) for name in ("factors", "relative_std", "length")}
+    record["mean_surface"] = {name: to_list(value) for name, value in vars(mean).items()}
     # The estimates are for people who read the file. `from_record` computes them again.
     estimates = found.parameters._asdict()
     record["estimates"] = {name: to_list(value) for name, value in estimates.items() if value is not None}
@@ -314,9 +314,9 @@ def from_record(record: dict[str, Any], dtype: Any) -> Identified:
 
     priors = {name: array(value) for name, value in record["unknowns"].items()}
     unknowns = Unknowns(priors.pop("friction"), **priors, sides=record["sides"], shared=tuple(record["shared"]))
-    mean = PriorSurface(**{name: array(value) for name, value in record["mean_surface"].items()})
-    conditions, terms = mean.factors.shape[:2]
-    layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
+    kind = PriorFeet if "limit" in record["mean_surface"] else PriorSurface
+    mean = kind(**{name: array(value) for name, value in record["mean_surface"].items()})
+    layout = Layout.of(unknowns, mean.entries, len(mean.length))
     known = {name: array(value) for name, value in record["known"].items()}
     prior = Prior(unknowns, known, mean, array(record["origin"]), layout)
     arrays = {name: array(record[name]) for name in ARRAYS}

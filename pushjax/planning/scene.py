@@ -13,11 +13,10 @@ from pushjax._internal.checks import ArrayLike, check_count, check_key, check_ty
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
 from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand, RoundFinger
-from pushjax.simulation.random_rollout import Draws, draw
+from pushjax.simulation.random_rollout import Distributions, Draws, draw
 from pushjax.simulation.slider import Slider
 
 
@@ -86,7 +85,7 @@ def draw_friction(key: PRNGKeyArray, surface: LimitSurface, model: FrictionModel
     check_type("model", model, FrictionModel)
     check_count("samples", samples)
     _check_model(model)
-    return _draw(key, model.around(surface), model, jnp.arange(samples))
+    return _draw(key, Distributions(model.around(surface), None), model, jnp.arange(samples))
 
 
 def _check_model(model: FrictionModel) -> None:
@@ -95,8 +94,8 @@ def _check_model(model: FrictionModel) -> None:
 
 
 @quick_jit
-def _draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel, indices: jax.Array) -> Draws:
-    return jax.vmap(lambda index: draw(jax.random.fold_in(key, index), surfaces, model, 1))(indices)
+def _draw(key: PRNGKeyArray, distributions: Distributions, model: FrictionModel, indices: jax.Array) -> Draws:
+    return jax.vmap(lambda index: draw(jax.random.fold_in(key, index), distributions, model, 1))(indices)
 
 
 def mean_friction(surface: LimitSurface, model: FrictionModel) -> Draws:

@@ -248,7 +248,7 @@ def test_conditions_share_the_calibration(square, hand):
 def test_layout_of_the_vector():
     shared = ("pressure_center", "overshoot")
     unknowns = pj.Unknowns((0.0, 1.0), surface_dof=20, pressure_center=0.001, overshoot=0.001, shared=shared)
-    layout = Layout.of(unknowns, 2, 3)
+    layout = Layout.of(unknowns, 6, 3)
     assert layout.size == 3 * 1 + 3 * 6 + 2 + 1
     assert layout.positions.shape == (3, 10)
     assert layout.labels[:5] == ("friction[0]", "friction[1]", "friction[2]", "surface[0].0", "surface[0].1")
