@@ -20,14 +20,16 @@ TILE, SEARCH_TILE = 256, 128
 Attempt = Callable[..., tuple[Any, Bool[Array, " batch"]]]
 
 
-def in_tiles(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, ""], *args: Any) -> Any:
+def in_tiles(
+    attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, ""], *args: Any, tile: int = TILE
+) -> Any:
     """Return results of `attempt` for one example or a batch, under any nesting of `vmap`; zeros if not needed."""
     # The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
     # attempt, or have no first one, are gathered into tiles of their own, which follow. One program serves both. It
     # cannot be differentiated.
 
     def of_batch(batched: Any, wanted: Array, args: Any) -> Any:
-        return _tile_by_tile(attempt, wanted, batched, args)
+        return _tile_by_tile(attempt, wanted, batched, args, tile)
 
     @jax.jit
     def single(wanted: Array, args: Any) -> Any:
@@ -36,13 +38,13 @@ def in_tiles(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, "
     return in_one_batch(single, of_batch, jnp.stack([needed & has_first, needed & ~has_first]), args)
 
 
-def _tile_by_tile(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, args: Any) -> Any:
+def _tile_by_tile(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, args: Any, tile: int) -> Any:
     """The results of a batch, with the batch first, tile by tile; `wanted` has the first and the second attempt."""
     size = wanted.shape[0]
     if not size:
         one = jax.tree.map(lambda x, b: jnp.zeros((1, *x.shape[1:]), x.dtype) if b else x, args, batched)
-        return jax.tree.map(lambda x: x[:0], _tile_by_tile(attempt, jnp.zeros((1, 2), bool), batched, one))
-    tile = min(tile_size(TILE), size)
+        return jax.tree.map(lambda x: x[:0], _tile_by_tile(attempt, jnp.zeros((1, 2), bool), batched, one, tile))
+    tile = min(tile_size(tile), size)
 
     @jax.jit  # traced once, for the shapes and for the loop
     def attempt_at(again: Int[Array, ""], rows: Array) -> tuple[Any, Array]:

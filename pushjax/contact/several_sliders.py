@@ -120,17 +120,29 @@ def solve_sliders(
     If not `anew`, only Newton steps are made, with the unknowns that may be positive at `start`.
     """
     problem, valid = problem.usable()
-    pushes, anew = jnp.any(problem.active & (problem.goal[0] > 0), axis=0), jnp.asarray(anew)
+    pushes, anew = problem.pushes(), jnp.asarray(anew)
     if start is None:
         start = Start.none(problem.count, jnp.zeros_like(problem.rows[0, 0, :, 0]))
     start = Start(*(jnp.broadcast_to(x, (*x.shape[:-1], *pushes.shape)) for x in start))
     before = _motion(problem, start.force, start.dissipation, start.basic, 0, near=start.normal)
-    found = _where(anew & pushes, _in_rounds(problem, before, start.exists & pushes, pushes & anew), before)
-    is_jam = found.status == Status.JAMMED
-    found = _refined(problem, found, pushes & ~is_jam & (anew | start.exists))
+    tolerance = TOLERANCE[before.force.dtype.itemsize]
+
+    def attempt(state: tuple[SlidersMotion, Array, Array]) -> tuple[SlidersMotion, Array, Array]:
+        """Search from the start, then, where that fails, from nothing."""
+        found, wanted, number = state
+        exists = start.exists & (number == 0)
+        new = _where(anew & wanted, _in_rounds(problem, before, exists & wanted, wanted & anew), before)
+        new = _refined(problem, new, wanted & (new.status != Status.JAMMED) & (anew | exists))
+        is_better = wanted & ((number == 0) | (new.status == Status.JAMMED) | (new.violation < found.violation))
+        found = _where(is_better, new, found)
+        unsolved = (found.status != Status.JAMMED) & (found.violation > tolerance)
+        return found, wanted & exists & unsolved & anew, number + 1
+
+    first = before, pushes, jnp.zeros((), jnp.int32)
+    found, *_ = jax.lax.while_loop(lambda state: jnp.any(state[1]), attempt, first)
     unsolved = jnp.full_like(found.status, Status.NOT_CONVERGED)
-    status = jnp.where(found.violation <= TOLERANCE[found.force.dtype.itemsize], Status.MOVING, unsolved)
-    status = jnp.where(is_jam, Status.JAMMED, status)
+    status = jnp.where(found.violation <= tolerance, Status.MOVING, unsolved)
+    status = jnp.where(found.status == Status.JAMMED, Status.JAMMED, status)
     status = jnp.where(valid, jnp.where(pushes, status, Status.FREE), Status.INVALID).astype(jnp.int8)
     still = jax.tree.map(jnp.zeros_like, found)._replace(mode=jnp.full_like(found.mode, ContactMode.SEPARATED))
     found, still = (x._replace(status=status, violation=found.violation, rounds=found.rounds) for x in (found, still))

@@ -44,6 +44,10 @@ class SlidersProblem(NamedTuple):
         """The motion (n, t) at each contact relative to its goal; a normal motion below zero is a violation."""
         return jnp.sum(self.rows * twist[None, :, :, None], axis=(1, 2)) - self.goal
 
+    def pushes(self) -> Bool[Array, " batch"]:
+        """Whether a contact would be violated if nothing moved."""
+        return jnp.any(self.active & (self.goal[0] > 0), axis=0)
+
     def usable(self) -> tuple["SlidersProblem", Bool[Array, " batch"]]:
         """The problem without numbers that cannot be computed with, all of one batch, and whether there were none."""
         size = jnp.broadcast_shapes(*(leaf.shape[-1:] for leaf in jax.tree.leaves(self)))

@@ -21,11 +21,14 @@ from pushjax.contact.contact_plane import Contact
 from pushjax.contact.linear_patch import MixedSurfaces, Surface
 from pushjax.contact.several_sliders import SlidersMotion, Start, differentiable_motion, solve_sliders
 from pushjax.contact.sliders_problem import SlidersProblem
-from pushjax.contact.status import Status
+from pushjax.contact.status import ContactMode, Status
 from pushjax.friction.feet import FeetForm
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.polynomial import Polynomial
 from pushjax.friction.support_points import SupportPoints
+
+# Problems that a CPU solves at once, times their contacts, so that tableaus stay in the cache; and the fewest problems.
+TILE, LEAST_TILE = 64, 8
 
 
 class Touching(NamedTuple):
@@ -133,7 +136,12 @@ def _rows(point: Vec2, normal: Vec2) -> Float[Array, "2 3 contacts"]:
 @eqx.filter_custom_jvp
 def _solve(problem: SlidersProblem, guess: Start) -> SlidersMotion:
     """Solve a problem of one example."""
-    return in_tiles(_attempt, jnp.ones((), bool), guess.exists, problem, guess)
+    usable, valid = jax.tree.map(lambda leaf: leaf[..., None], problem).usable()
+    needed = (usable.pushes() | ~valid)[0]  # else nothing moves
+    found = in_tiles(_attempt, needed, guess.exists, problem, guess, tile=max(TILE // problem.count, LEAST_TILE))
+    still = jnp.full_like(found.mode, ContactMode.SEPARATED), jnp.full_like(found.status, Status.FREE)
+    mode, status = tree_where(needed, (found.mode, found.status), still)
+    return found._replace(mode=mode, status=status)
 
 
 @_solve.def_jvp

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.problem import form_and_friction
@@ -150,6 +150,21 @@ def simulate_sliders(
     num_steps: Array | None = None,
 ) -> Trajectory:
     """Roll out a path, with arguments that have been checked. `rollout` is the public function."""
+    prepared, first, valid = prepared_sliders(shapes, hand, path, pose, friction_at, fixtures)
+    records, fraction = simulate_in_substeps(prepared._replace(num_steps=num_steps), Vec3.of(first.T))
+    lengths = jnp.stack([form.length for form in friction_at(jnp.zeros((), jnp.int32)).forms])
+    return trajectory_of(records, lengths, path, first, fraction, pose, valid, prepared.contact_names())
+
+
+def prepared_sliders(
+    shapes: tuple[Shape, ...],
+    hand: Hand,
+    path: Array,
+    pose: Array,
+    friction_at: Callable[[Array], SlidersFriction],
+    fixtures: Fixtures = (),
+) -> tuple[PreparedSliders, Array, Bool[Array, ""]]:
+    """Return what a rollout needs, with arguments as `simulate_sliders`, the first poses, and whether all are valid."""
     lengths = [form.length for form in friction_at(jnp.zeros((), jnp.int32)).forms]
     valid, usable = jnp.ones((), bool), []
     for shape, length, start in zip(shapes, lengths, pose, strict=True):
@@ -173,8 +188,5 @@ def simulate_sliders(
         push.motions_at,
         lambda step: own_friction_at(step)._replace(fingers=push.friction_at(step, Vec3.of(first[0]))[1]),
         push.fixtures,
-        num_steps,
     )
-    records, fraction = simulate_in_substeps(prepared, Vec3.of(first.T))
-    contacts = prepared.contact_names()
-    return trajectory_of(records, jnp.stack(lengths), path, first, fraction, pose, valid, contacts)
+    return prepared, first, valid

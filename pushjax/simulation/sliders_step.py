@@ -6,7 +6,7 @@ together (`sliders_solving`).
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -146,13 +146,23 @@ def depth_of_sliders(bodies: tuple[Body, ...], meetings: list[Meeting], pose: Ve
 @quick_jit
 def mutual_overlaps(shapes: tuple[Shape, ...], poses: Array) -> Array:
     """Return the depth of each pair of sliders in each other, m, for each of many poses (pushes, sliders, 3), world."""
-    bodies = tuple(Body.of(shape, jnp.zeros(len(shapes), poses.dtype)) for shape in shapes)
+    bodies = _without_friction(shapes, poses.dtype)
     pairs = meetings_of(bodies, (), ())
 
     def depths_of(pose: Array) -> Array:
         return jnp.stack([depth_of_sliders(bodies, [pair], Vec3.of(pose.T), 0.0) for pair in pairs])
 
     return jax.vmap(depths_of)(poses)
+
+
+def mutual_depth(shapes: tuple[Shape, ...], pose: Vec3) -> Scalar:
+    """Return the depth of the two sliders that are deepest in each other, m; negative where all are apart."""
+    bodies = _without_friction(shapes, pose.x.dtype)
+    return depth_of_sliders(bodies, meetings_of(bodies, (), ()), pose, 0.0)
+
+
+def _without_friction(shapes: tuple[Shape, ...], dtype: Any) -> tuple[Body, ...]:
+    return tuple(Body.of(shape, jnp.zeros(len(shapes), dtype)) for shape in shapes)
 
 
 class _PushingPart(NamedTuple):

@@ -3,6 +3,8 @@ from .environment import TaskParams as TaskParams
 from .environment import TaskState as TaskState
 from .push_along_wall import PushAlongWall as PushAlongWall
 from .push_box import PushBox as PushBox
+from .push_clutter import ClutterParams as ClutterParams
+from .push_clutter import PushClutter as PushClutter
 from .push_t import PushT as PushT
 from .push_t import PushTParams as PushTParams
 from .push_two_fingers import PushTwoFingers as PushTwoFingers

@@ -6,7 +6,9 @@ the slider inside a wall, it is computed again with all contacts; in a batch, on
 of other hands are always computed with all contacts.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +22,13 @@ from pushjax.contact.status import Status
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.polygon_outline import PolygonOutline
+from pushjax.geometry.shape import Shape
 from pushjax.simulation.finger_motion import DEPTH_PER_DISPLACEMENT
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.prepared_push import FrictionAt, prepared_push
 from pushjax.simulation.rollout import simulate
+from pushjax.simulation.several_sliders import PreparedSliders, SlidersFriction, prepared_sliders, simulate_sliders
 from pushjax.simulation.substeps import PreparedPush, PushState, max_trials
 from pushjax.simulation.trajectory import Trajectory
 from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, separate
@@ -69,18 +73,44 @@ def control_step(
     # If the hand is one round finger, a slider that overlaps the finger or a wall deeply at the start is pushed out
     # (`separation`), and the status of all steps is then OVERLAPPING.
     args = polygon, surface, friction, hand, walls, path, pose
-    in_rounds = Rounds(_begin, _advance, _is_ongoing, _finish)
     if not _is_finger(hand):
-        # Always needed, and yet `where_needed`: in a batch it computes in rounds, so that no example waits for another.
-        at_start = ControlStepResult(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
-        return where_needed(jnp.ones((), bool), _with_all_contacts, at_start, *args, rounds=in_rounds)
+        return _in_rounds(_with_all_contacts, _divided, *args)
     with_one_contact = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
     push, allowed = ControlStepResult.of(with_one_contact), _allowed_overlap(surface, path)
     deep = jax.lax.stop_gradient(_depth_at_start(*args) > jnp.maximum(DEEP * surface.length, allowed))
     if walls or not polygon.convex:  # else there is no other contact
         valid = jax.lax.stop_gradient(_is_valid(with_one_contact, polygon, surface, walls, allowed))
-        push = where_needed(~valid & ~deep, _with_all_contacts, push, *args, rounds=in_rounds)
+        push = where_needed(~valid & ~deep, _with_all_contacts, push, *args, rounds=_rounds(_divided))
     return where_needed(deep, _separated, push, *args)
+
+
+def control_step_of_sliders(
+    shapes: tuple[Shape, ...],
+    friction: SlidersFriction,
+    hand: Hand,
+    path: Float[Array, "steps+1 dof"],
+    pose: Float[Array, "sliders 3"],
+) -> ControlStepResult:
+    """Push several sliders along a short path of the hand."""
+    return _in_rounds(_with_several, _divided_several, shapes, friction, hand, path, pose)
+
+
+def _in_rounds(compute: Callable[..., ControlStepResult], divided: Callable[..., Any], *args) -> ControlStepResult:
+    """Return the control step, with arguments whose last ones are path and pose."""
+    # Always needed, and yet `where_needed`: in a batch it computes in rounds, so that no example waits for another.
+    path, pose = args[-2:]
+    at_start = ControlStepResult(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
+    return where_needed(jnp.ones((), bool), compute, at_start, *args, rounds=_rounds(divided))
+
+
+@jax.jit
+def _with_several(shapes, friction, hand, path, pose) -> ControlStepResult:
+    return ControlStepResult.of(simulate_sliders(shapes, hand, path, pose, lambda step: friction, ()))
+
+
+def _divided_several(shapes, friction, hand, path, pose) -> tuple[PreparedSliders, Array]:
+    push, start, _ = prepared_sliders(shapes, hand, path, pose, lambda step: friction)
+    return push, start.T
 
 
 def _is_finger(hand: Hand) -> bool:
@@ -154,22 +184,27 @@ def _divided(polygon, surface, friction, hand, walls, path, pose) -> tuple[Prepa
     return prepared_push(polygon, hand, path, pose, solver, friction_at, walls)
 
 
-@jax.jit
-def _begin(*args) -> _Progress:
-    """Return the state before the first trial."""
-    push, start = _divided(*args)
-    trials = jnp.full((), max_trials(push.steps), jnp.int32)
-    return _Progress(push.first_state(Vec3.of(start)), trials, jnp.full(push.steps, -1, jnp.int8))
+@cache
+def _rounds(divided: Callable[..., Any]) -> Rounds:
+    """Return the control step as rounds, each of which tries a part of a step of the push that `divided` returns."""
 
+    @jax.jit
+    def begin(*args) -> _Progress:
+        """Return the state before the first trial."""
+        push, start = divided(*args)
+        trials = jnp.full((), max_trials(push.steps), jnp.int32)
+        return _Progress(push.first_state(Vec3.of(start)), trials, jnp.full(push.steps, -1, jnp.int8))
 
-@jax.jit
-def _advance(progress: _Progress, *args) -> _Progress:
-    """Try the next part of a step, and note the status of the step if that ended it."""
-    state, (_, end) = _divided(*args)[0].trial(progress.push, progress.trials_left)
-    status = progress.status.at[jnp.where(end.ended, end.step, len(progress.status))].set(
-        end.outcome.status, mode="drop"
-    )
-    return _Progress(state, progress.trials_left - 1, status)
+    @jax.jit
+    def advance(progress: _Progress, *args) -> _Progress:
+        """Try the next part of a step, and note the status of the step if that ended it."""
+        state, (_, end) = divided(*args)[0].trial(progress.push, progress.trials_left)
+        status = progress.status.at[jnp.where(end.ended, end.step, len(progress.status))].set(
+            end.outcome.status, mode="drop"
+        )
+        return _Progress(state, progress.trials_left - 1, status)
+
+    return Rounds(begin, advance, _is_ongoing, _finish)
 
 
 def _is_ongoing(progress: _Progress, *args) -> Bool[Array, ""]:
@@ -185,4 +220,5 @@ def _finish(progress: _Progress, *args) -> ControlStepResult:
     # The hand is at the end of the path, or within the last step that was done if something stopped it there.
     step = jnp.where(last.stop_status != 0, jnp.sum(progress.status >= 0) - 1, steps)
     before, after = path[step], path[jnp.minimum(step + 1, steps)]
-    return ControlStepResult(last.pose.array(), before + last.done * (after - before), status)
+    pose = jnp.stack(last.pose, axis=-1)
+    return ControlStepResult(pose, before + last.done * (after - before), status)

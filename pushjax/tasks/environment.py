@@ -80,7 +80,8 @@ class TaskState(_Replaceable):
     """State of an episode.
 
     Attributes:
-        pose: Pose of the slider's frame, (3,), world, length unit of the task and rad; the angle is not wrapped.
+        pose: Pose of the slider's frame, (3,), world, length unit of the task and rad; the angle is not wrapped. Of
+            several sliders, (sliders, 3).
         hand: Configuration of the hand, (dof,), world.
         velocity: Its velocity, (dof,), per second.
         time: Number of control steps since the reset.
@@ -136,6 +137,10 @@ class Environment(ABC):
     @abstractmethod
     def draw_start(self, key: PRNGKeyArray, params: Any) -> tuple[Array, Array]:
         """Return a random pose of the slider, (3,), and configuration of the hand, (dof,)."""
+
+    def draw_surface(self, key: PRNGKeyArray, params: Any) -> LimitSurface:
+        """Return a random limit surface of the slider, with a `model`."""
+        return params.surfaces.sample(key).surface
 
     @abstractmethod
     def walk(self, state: TaskState, action: Array) -> tuple[Array, Array]:
@@ -241,7 +246,7 @@ class Environment(ABC):
         state = TaskState(pose, hand, jnp.zeros_like(hand), jnp.zeros((), jnp.int32), next_start=next_start)
         if params.model is not None:
             surface_key, contact_key = jax.random.split(friction_key)
-            surface = params.surfaces.sample(surface_key).surface
+            surface = self.draw_surface(surface_key, params)
             state = state.replace(surface=surface, friction=params.model.sample_friction(contact_key))
         return self.observe(observation_key, state, None, params), state
 
@@ -271,7 +276,7 @@ class Environment(ABC):
         pushed = self._push(state, path, params)
         stopped = jnp.any((pushed.status == Status.JAMMED) | (pushed.status == Status.GRASPED))
         unsolved = jnp.any(pushed.status == Status.NOT_CONVERGED)
-        pose = jnp.concatenate([pushed.pose[:2] / self.METERS, pushed.pose[2:]])
+        pose = jnp.concatenate([pushed.pose[..., :2] / self.METERS, pushed.pose[..., 2:]], axis=-1)
         hand = jnp.where(stopped, pushed.configuration / self.METERS, path[-1])
         new_state = state.replace(
             pose=jnp.where(unsolved, state.pose, pose),

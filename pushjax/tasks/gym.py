@@ -33,7 +33,7 @@ except ImportError as error:
     raise ImportError(f"pushjax.tasks.gym needs Gymnasium 1.1 or later: pip install '.[gym]' ({error})") from None
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
-TASKS = "PushT", "PushBox", "PushAlongWall", "PushTwoFingers", "Squeeze"  # that are registered
+TASKS = "PushT", "PushBox", "PushAlongWall", "PushTwoFingers", "Squeeze", "PushClutter"  # that are registered
 _processes: list[int] = []  # in which an environment was made; a fork inherits the numbers
 
 

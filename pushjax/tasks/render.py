@@ -33,6 +33,8 @@ ROYAL_BLUE: Color = (65, 105, 225)
 ROYAL_BLUE_FILL: Color = (78, 126, 255)
 LIGHT_SLATE_GRAY: Color = (119, 136, 153)
 LIGHT_SLATE_GRAY_FILL: Color = (143, 163, 184)
+BURLY_WOOD: Color = (190, 155, 110)
+BURLY_WOOD_FILL: Color = (222, 184, 135)
 RED: Color = (255, 0, 0)
 
 
@@ -102,12 +104,13 @@ def _render(
 @quick_jit
 def render_table(
     vertices: Float[Array, "vertices 2"],  # of the block, m
-    goal: Float[Array, "goal_vertices 2"],  # its vertices at the goal, m
+    goal: Float[Array, "goal_vertices 2"],  # its vertices at the goal, m; none for no goal
     hand: Hand,
     configuration: Float[Array, "dof"],  # of the hand, m and rad
     walls: tuple[Wall, ...],  # what is behind them is drawn gray
     width: float,  # width and height of the part of the table that is drawn, m
     size: int,  # width and height of the picture in pixels
+    others: tuple[Float[Array, "vertices 2"], ...] = (),  # vertices of other blocks, m
 ) -> UInt8[Array, "size size 3"]:
     """Draw a table from above in RGB, rows from the top, with x to the right, y up and the origin in the middle."""
     pixels, scale = _Pixels.of(size, vertices.dtype), WORKSPACE / width
@@ -115,11 +118,15 @@ def render_table(
     def drawn(points: Array) -> Array:
         return WORKSPACE / 2 + scale * points * jnp.array([[1.0, -1.0]], points.dtype)
 
-    picture = _Picture.blank(size, vertices.dtype).polygon(pixels, drawn(goal), LIGHT_GREEN)
+    picture = _Picture.blank(size, vertices.dtype)
+    if len(goal):
+        picture = picture.polygon(pixels, drawn(goal), LIGHT_GREEN)
     for wall in walls:
         along, into = width * jnp.array([-wall.normal[1], wall.normal[0]]), -width * wall.normal
         behind = jnp.stack([along, -along, into - along, into + along]) + wall.point[None]
         picture = picture.polygon(pixels, drawn(behind), LIGHT_GRAY)
+    for other in others:
+        picture = picture.polygon(pixels, drawn(other), BURLY_WOOD_FILL, BURLY_WOOD)
     picture = picture.polygon(pixels, drawn(vertices), LIGHT_SLATE_GRAY_FILL, LIGHT_SLATE_GRAY)
     for finger, pose in zip(hand.fingers, hand.poses(configuration[None])[0], strict=True):
         if isinstance(finger, RoundFinger):

@@ -316,7 +316,7 @@ def test_goes_on_from_a_pickle(push_t):
         (
             {"task": "PushP"},
             ValueError,
-            "task must be one of PushT, PushBox, PushAlongWall, PushTwoFingers, Squeeze; got 'PushP'",
+            "task must be one of PushT, PushBox, PushAlongWall, PushTwoFingers, Squeeze, PushClutter; got 'PushP'",
         ),
         ({"task": 3}, TypeError, "task: expected a Environment; got a int"),
         ({"task": Walk(), "substeps": 2}, TypeError, "substeps: options go with the name of a task"),
