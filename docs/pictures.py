@@ -38,7 +38,7 @@ from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning.pusht import PIXEL, pusht_pose
 from pushjax.plot.parts import draw_fixtures, placed_outline
 from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, MM, ORANGE, RED, STYLE, legend_below, panel_row
-from pushjax.tasks import PushAlongWall, PushBox, PushTwoFingers, Squeeze, TableTask
+from pushjax.tasks import PushAlongWall, PushBox, PushClutter, PushTwoFingers, Squeeze, TableTask
 from pushjax.tasks.push_t import AGENT_RADIUS, T_CENTER, T_VERTICES
 from pushjax.tasks.push_t import GOAL as GOAL_IN_GYM
 
@@ -285,6 +285,11 @@ EPISODES: tuple[tuple[TableTask, tuple[float, ...], tuple[tuple[int, tuple[float
         (-0.0903, -0.0371, 0.7505, 0.14, -0.0945, -0.0314, 0.3505),
         ((4, (0.0, 0.0, 0.0, -1.0)), (5, (0.895, 0.371, -0.75, -1.0))),
     ),
+    (
+        PushClutter(blocks=3),
+        (-0.155, 0.0, 0.02, 0.0, 0.0, -0.07, 0.0, 0.0, -0.005, 0.075, 0.5),
+        ((10, (1.0, 0.0)), (1, (0.25, 0.0))),
+    ),
 )
 
 
@@ -303,10 +308,11 @@ def tasks() -> Figure:
                 ends = k in (0, len(states) - 1)
                 if ends or k % 2 == 0:
                     width, poses = 1.3 if ends else 0.8, np.asarray(env.hand_model.poses(state.hand[None])[0])
-                    plot.outline(axes, params.slider.shape, np.asarray(state.pose), BLACK if ends else GRAY, width)
+                    for pose in np.asarray(state.pose).reshape(-1, 3):
+                        plot.outline(axes, params.slider.shape, pose, BLACK if ends else GRAY, width)
                     plot.hand_at(axes, env.hand_model, poses, BLUE if ends else PALE, width)
             axes.plot(*MM * np.array([state.hand[:2] for state in states]).T, color=BLUE, lw=0.8, ls=":")
-            axes.set(title=env.name, xlim=(-210, 160), ylim=(-185, 185), aspect="equal", xlabel="mm")
+            axes.set(title=env.name, xlim=(-210, 200), ylim=(-185, 185), aspect="equal", xlabel="mm")
     return figure
 
 

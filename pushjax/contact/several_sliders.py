@@ -41,8 +41,8 @@ SAME_COVER, GOLDEN = 6, 0.6180339887  # rounds with the same covering vector, an
 LEAST_DECREASE = 0.9  # of the violation from a Newton round to the next, for another one to follow
 MAX_FACTOR = 10.0  # of a weight, from a round to the next
 MAX_REFINEMENTS = 6  # Newton steps after the rounds, with the unknowns that may be positive in the best of them
-# Keyed by the bytes of a float: largest violation of a condition of a motion, where the rounds end, and Newton steps.
-TOLERANCE, NEARLY, ROUNDOFF = {4: 1e-4, 8: 1e-9}, {4: 5e-4, 8: 1e-9}, {4: 1e-6, 8: 1e-13}
+# Keyed by the bytes of a float: largest violation of a condition of a motion, and where Newton steps end.
+TOLERANCE, ROUNDOFF = {4: 1e-4, 8: 1e-9}, {4: 1e-6, 8: 1e-13}
 CERTIFICATE = {4: 1e-3, 8: 1e-6}  # largest wrench that is zero, and least power that is not, of forces of sum one
 
 
@@ -192,7 +192,7 @@ def _next_round(problem: SlidersProblem, mean: Float[Array, "3 3 sliders batch"]
     next_round = _where(goes_on, after._replace(is_newton=tries_newton), weights)
     violation = jnp.where(newton, motion.violation, jnp.inf)
     is_better = jams | (motion.violation < state.best.violation)
-    ends = jams | (motion.violation <= NEARLY[force.dtype.itemsize])
+    ends = jams | (motion.violation <= TOLERANCE[force.dtype.itemsize])
     best = _where(state.ongoing & is_better, motion, state.best)
     return _State(next_round, weights, number, violation, best, state.ongoing & ~ends, state.number + 1)
 

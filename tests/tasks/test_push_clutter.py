@@ -77,7 +77,7 @@ def test_blocks_that_are_apart_are_singulated():
 
 def test_batches_in_gymnasium():
     gymnasium = pytest.importorskip("gymnasium")
-    import pushjax.tasks.gym  # noqa: F401, PLC0415
+    import pushjax.tasks.gym  # noqa: F401
 
     envs = gymnasium.make_vec("pushjax/PushClutter-v0", num_envs=4, blocks=2)
     first, _ = envs.reset(seed=3)
