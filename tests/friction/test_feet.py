@@ -84,6 +84,31 @@ def test_surface_of_feet(tmp_path):
         np.testing.assert_allclose(found / np.linalg.norm(found), twist / np.linalg.norm(twist), atol=1e-7)
 
 
+def test_random_loads():
+    """Each load has its mean, and a relative variance of 2 / dof."""
+    surface = Slider.on(BOX, pj.Support.tripod(TRIPOD, load=2.0), exact=True).surface
+    around = pj.FrictionModel(20.0, 0.3).around(surface)
+    drawn = jax.vmap(lambda key: around.sample(key).surface)(jax.random.split(jax.random.key(0), 20_000))
+    factor = np.asarray(drawn.limit / surface.limit[None])
+    np.testing.assert_allclose(factor.mean(axis=0), 1, atol=0.01)
+    np.testing.assert_allclose(factor.var(axis=0), 2 / 20, rtol=0.05)
+    assert np.abs(np.corrcoef(factor.T) - np.eye(3)).max() < 0.03
+    np.testing.assert_array_equal(drawn.length, np.full(20_000, surface.length))
+
+
+@SLOW
+def test_searches_that_start_near_end_where_others_do():
+    for item in (jnp.float64, jnp.float32):
+        for points in (2, 3, 16):
+            place, limit, wrench = (jnp.asarray(x, item) for x in random_feet(points, 1000))
+            _, normal, _ = patch(place, limit, wrench)
+            for far in (1e-4, 1e-2, 0.1, 1.0):
+                moved = wrench + far * jnp.asarray(np.random.default_rng(1).normal(size=wrench.shape), item)
+                gauge = patch(place, limit, moved)[0]
+                again = jax.jit(lambda *x: SupportPoints(x[0], x[1]).patch(x[2], x[3])[0])(place, limit, moved, normal)
+                np.testing.assert_allclose(again, gauge, rtol=1e-12 if item == jnp.float64 else 2e-6)
+
+
 @SLOW
 def test_derivatives_are_those_of_differences():
     point, limit, wrench = (jnp.asarray(x[..., 0]) for x in random_feet(4, 8))

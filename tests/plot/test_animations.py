@@ -42,6 +42,33 @@ def lines(axes) -> dict[str, np.ndarray]:
     return {line.get_label(): np.asarray(line.get_xydata()) for line in axes.lines}
 
 
+def test_several_sliders():
+    """The force of a contact is drawn in the frame of the slider that it names."""
+    pose = np.array([[[0, 0, 0], [0.1, 0, 0]], [[0.01, 0, 0], [0.1, 0.02, np.pi / 2]]])
+    one = trajectory(
+        pose,
+        [[0.0, -0.1], [0.0, -0.1]],
+        force=[[[2.0, 0.0]]],
+        contact_point=[[[0.01, 0.0]]],
+        contact_normal=[[[1.0, 0.0]]],
+    )
+    one = replace(one, twist=jnp.zeros((1, 2, 3)), contacts=(("slider 1", "slider 0"),))
+    moving = plot.animate((BLOCK, BLOCK), FINGER, one, frames=2)
+    (axes,) = moving.figure.axes
+    moving.draw(1)
+    places = [line.get_xydata() for line in axes.lines]
+    for expected in (in_world(pose[1, 0]), in_world(pose[1, 1])):
+        assert any(place.shape == expected.shape and np.allclose(place, expected) for place in places)
+    (arrows,) = axes.collections
+    np.testing.assert_allclose(arrows.get_offsets(), [[100.0, 30.0]], atol=1e-9)
+    np.testing.assert_allclose(arrows.U, 0, atol=1e-9)
+    assert arrows.V[0] > 0
+    picture = plot.push_figure((BLOCK, BLOCK), FINGER, {"two": one})
+    drawn = [line.get_xydata() for line in picture.axes[0].lines]
+    assert any(place.shape == expected.shape and np.allclose(place, expected) for place in drawn)
+    plt.close("all")
+
+
 def test_frames_show_the_push(push):
     moving = plot.animate(BLOCK, FINGER, {"push": push}, frames=21)
     (axes,) = moving.figure.axes

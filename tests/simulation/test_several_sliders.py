@@ -181,6 +181,7 @@ def test_bad_arguments():
         ({"slider": (T, T)}, r"one must be a disk or a convex polygon; sliders \[0, 1\] are not"),
         ({"slider": ()}, "needs at least one"),
         ({"solver": pj.Exhaustive()}, "solver and table are for one slider"),
+        ({"pose": 0.5 * poses}, r"pose: sliders 0 and 1 start inside each other, by 25 mm; at most 4.4 mm"),
     ):
         given = {"slider": (DISK, DISK), "pose": poses, "between": 0.1} | arguments
         with pytest.raises(ValueError, match=message):
@@ -189,6 +190,54 @@ def test_bad_arguments():
         pj.rollout(DISK, FINGER, path, pose=poses[0], friction=0.2, between=0.1)
     with pytest.raises(TypeError, match="slider"):
         pj.rollout((DISK, SURFACE), FINGER, path, pose=poses, friction=0.2, between=0.1)
+
+
+@pytest.mark.slow
+def test_random_friction():
+    """A push of a Monte Carlo run is a random rollout; its friction is within the ranges."""
+    sliders = (
+        DISK,
+        pj.Slider.on(SQUARE.shape, pj.Support.tripod([[-0.02, -0.02], [0.02, -0.02], [0, 0.02]]), exact=True),
+    )
+    poses, path = two_disks(0.008, 0.006)
+    poses[1, 2] = 0.2
+    model = pj.FrictionModel(40.0, (0.2, 0.4))
+    given = {"pose": poses, "model": model, "between": (0.1, 0.3)}
+    runs = pj.monte_carlo(jax.random.key(0), 64, sliders, FINGER, path, **given, trajectories=True)
+    assert runs.pose.shape == (64, 2, 3)
+    assert runs.trajectory.shape == (64, STEPS + 1, 2, 3)
+    assert runs.outcomes()["failed"] == 0
+    assert np.all(runs.pose[:, :, :2].std(axis=0).max(axis=1) > 1e-5)
+    summary = runs.summary()["pose"]
+    np.testing.assert_allclose([one["x"]["mean"] for one in summary], runs.pose[:, :, 0].mean(axis=0))
+    one = pj.random_rollout(jax.random.fold_in(jax.random.key(0), 5), sliders, FINGER, path, **given)
+    np.testing.assert_allclose(one.push.pose[-1], runs.pose[5], atol=1e-7)
+    assert 0.1 <= float(one.draws.between[0, 0, 1]) <= 0.3
+    assert len(one.draws.surface) == 2
+    np.testing.assert_array_equal(one.draws.surface[1].point[0], sliders[1].surface.point)
+    assert np.all(one.draws.surface[1].limit[0] != sliders[1].surface.limit)
+    # each push from its own start
+    starts = np.broadcast_to(poses, (64, 2, 3)) + np.linspace(0, 0.002, 64)[:, None, None] * [1.0, 0.0, 0.0]
+    runs = pj.monte_carlo(jax.random.key(0), 64, sliders, FINGER, path, **(given | {"pose": starts}), trajectories=True)
+    one = pj.random_rollout(
+        jax.random.fold_in(jax.random.key(0), 5), sliders, FINGER, path, **(given | {"pose": starts[5]})
+    )
+    np.testing.assert_allclose(one.push.pose[-1], runs.pose[5], atol=1e-7)
+    with pytest.raises(ValueError, match="between must be"):
+        pj.random_rollout(jax.random.key(0), sliders, FINGER, path, **(given | {"between": (0.3, 0.1)}))
+
+
+def test_bodies_of_contacts():
+    poses, path = two_disks(0.01, 0.0)
+    wall = pj.Wall((0.2, 0.0), (-1.0, 0.0), 0.2)
+    found = push((DISK, SQUARE), path, poses, fixtures=(wall,))
+    fingers = [("slider 0", "finger 0"), ("slider 1", "finger 0")]
+    fixed = [("slider 0", "fixture 0"), *[("slider 1", "fixture 0")] * 2]
+    assert found.contacts[:5] == (*fingers, *fixed)
+    assert set(found.contacts[5:]) == {("slider 1", "slider 0")}
+    assert len(found.contacts) == found.force.shape[1]
+    alone = pj.rollout(SQUARE, FINGER, path, pose=poses[0], friction=FRICTION, fixtures=(wall,))
+    assert alone.contacts == (("slider 0", "finger 0"), *[("slider 0", "fixture 0")] * 2)
 
 
 @pytest.mark.slow
