@@ -196,7 +196,8 @@ class Prior(eqx.Module):
     @staticmethod
     def of(unknowns: Unknowns, surface: LimitSurface, known: dict[str, Array], origin: Array) -> "Prior":
         """Return the prior for surfaces and known parameters with a leading axis of conditions."""
-        mean = (PriorFeet if isinstance(surface, Feet) else PriorSurface).of(surface, unknowns.surface_dof)
+        of = PriorFeet.of if isinstance(surface, Feet) else PriorSurface.of
+        mean = of(surface, unknowns.surface_dof)  # pyright: ignore[reportArgumentType]
         if isinstance(mean, PriorFeet) and ("pressure_center" in unknowns.names or "pressure_center" in known):
             raise ValueError("pressure_center: of exact support points, the friction limits determine it; leave it out")
         return Prior(unknowns, known, mean, origin, Layout.of(unknowns, mean.entries, len(mean.length)))

@@ -1,7 +1,7 @@
 """Checks of the arguments of steps and rollouts, and their conversion to one floating dtype."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,6 +164,18 @@ def _check_start_beside_each_other(sliders: tuple[Slider, ...], poses: Array) ->
         )
 
 
+class Scene(NamedTuple):
+    """Everything about a rollout but its solver."""
+
+    slider: Any  # one slider, or a tuple of several
+    hand: Hand
+    path: Array
+    start: Array  # pose of each slider
+    friction: Any  # (fingers,); of several sliders with it the one of each with each
+    table: Table | None
+    fixtures: Fixtures
+
+
 def checked_scene(
     slider: Slider | Sequence[Slider],
     hand: Hand,
@@ -175,7 +187,7 @@ def checked_scene(
     table: Table | None,
     fixtures: Sequence[Wall | Fixture],
     pushes: int | None = None,
-):
+) -> Scene:
     """Return everything about a rollout, random or not, of one slider or of several; checked where values are known."""
     check_solver(solver)
     if isinstance(slider, tuple | list):
@@ -187,13 +199,13 @@ def checked_scene(
             raise ValueError("between is for several sliders; got one")
         checked = checked_rollout_arguments(slider, hand, path, pose, friction, pushes)
     start = checked[3]
-    fixed = checked_fixtures(fixtures, start.dtype)
-    if isinstance(slider, tuple | list):
-        for k, one in enumerate(checked[0]):
-            check_start_among_fixtures(one, fixed, start[..., k, :])
+    scene = Scene(*checked, checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype))
+    if isinstance(scene.slider, Slider):
+        check_start_among_fixtures(scene.slider, scene.fixtures, start)
     else:
-        check_start_among_fixtures(checked[0], fixed, start)
-    return *checked, checked_table(table, start.dtype), fixed
+        for k, one in enumerate(scene.slider):
+            check_start_among_fixtures(one, scene.fixtures, start[..., k, :])
+    return scene
 
 
 def _check_columns(path: Array, hand: Hand) -> None:

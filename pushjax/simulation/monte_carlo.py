@@ -112,17 +112,16 @@ def monte_carlo(
     check_type("model", model, FrictionModel)
     words = f"compiling and making {n} pushes"
     with progress_bar(words) if progress is True else nullcontext(progress or no_progress) as report:
-        *scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures, int(n))
-        slider, hand, path_array, start, table, fixed = scene
+        scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures, int(n))
         typed_key, used = _typed_key(key), Devices.of(devices)
         default_tile = TILE if used.local[0].platform == "cpu" else ACCELERATOR_TILE
         tile = batch_size or min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         used.gather(0)
-        distributions = Distributions.of(slider, model, limits)
-        setup = Setup(typed_key, distributions, model, shape_of(slider), hand, solver, table, fixed)
-        rounds = Rounds(int(n), int(tile), setup, used, np.asarray(start), np.asarray(path_array), trajectories)
-        results = _compute(rounds, slider, checkpoint, report)
+        distributions, shape = Distributions.of(scene.slider, model, limits), shape_of(scene.slider)
+        setup = Setup(typed_key, distributions, model, shape, scene.hand, solver, scene.table, scene.fixtures)
+        rounds = Rounds(int(n), int(tile), setup, used, np.asarray(scene.start), np.asarray(scene.path), trajectories)
+        results = _compute(rounds, scene.slider, checkpoint, report)
     share = float(np.mean(results["shrinkage"] > 0))
     if share > MANY_REPAIRS:
         warn(

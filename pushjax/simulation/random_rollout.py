@@ -1,7 +1,7 @@
 """Rollout of one push under random friction."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import checked_scene
+from pushjax.simulation.arguments import Scene, checked_scene
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import friction_on_table, simulate
@@ -81,6 +81,7 @@ def draw(key: PRNGKeyArray, distributions: Distributions, model: FrictionModel, 
             sample = surfaces.sample(surface_key)
             return Draws(sample.surface, model.sample_friction(friction_key), sample.shrinkage)
         keys = jax.random.split(surface_key, len(surfaces))
+        assert between is not None
         samples = [one.sample(own) for one, own in zip(surfaces, keys, strict=True)]
         (low, high), mutual_key = between, jax.random.fold_in(friction_key, 1)
         return Draws(
@@ -111,10 +112,11 @@ def rollout_under_draws(
     """Return a push under friction that was sampled before."""
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
     friction = friction.astype(pose.dtype)
+    surface: Any = draws.surface
     if isinstance(shape, tuple):
-        all_draws = jax.vmap(SlidersFriction.of)(draws.surface, friction, draws.between)
+        all_draws = jax.vmap(SlidersFriction.of)(surface, friction, draws.between)  # pyright: ignore[reportArgumentType]
     else:
-        all_draws = jax.vmap(form_and_friction)(draws.surface, friction)
+        all_draws = jax.vmap(form_and_friction)(surface, friction)
 
     first_draw = entry_at(all_draws, 0)
 
@@ -172,26 +174,28 @@ def random_rollout(
     """
     check_key(key)
     check_type("model", model, FrictionModel)
-    *scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures)
-    slider, hand, path_array, start, table, fixed = scene
-    distributions, shape = Distributions.of(slider, model, limits), shape_of(slider)
-    return _random_rollout(key, distributions, shape, hand, path_array, start, model, solver, table, fixed)
+    scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures)
+    distributions, shape = Distributions.of(scene.slider, model, limits), shape_of(scene.slider)
+    given = scene.hand, scene.path, scene.start, model, solver, scene.table, scene.fixtures
+    return _random_rollout(key, distributions, shape, *given)
 
 
-def checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures, pushes=None):
-    """Return slider or sliders, hand, path, start, table, fixtures, and the limits of the friction between sliders."""
-    is_range = between is not None and np.shape(between) == (2,)
+def checked_random_scene(
+    slider, hand, path, pose, between: Any, solver, table, fixtures, pushes: int | None = None
+) -> tuple[Scene, Array | None]:
+    """Return the arguments of a random rollout, and the lowest and highest friction between several sliders."""
+    is_range = np.shape(between) == (2,)  # that of None is ()
     low, high = between if is_range else (between, between)
-    rest = solver, table, fixtures, pushes
-    *scene, friction, table, fixed = checked_scene(slider, hand, path, pose, 0.0, high, *rest)
-    if not isinstance(scene[0], tuple):
-        return *scene, table, fixed, None
+    scene = checked_scene(slider, hand, path, pose, 0.0, high, solver, table, fixtures, pushes)
+    if isinstance(scene.slider, Slider):
+        return scene, None
     if is_range:
         least, most = (concrete(as_float(value, name="between")) for value in (low, high))
         if least is not None and most is not None and not 0 <= least <= most:
             raise ValueError(f"between must be (lowest, highest), not negative; got ({least:g}, {most:g})")
-    lowest = jnp.broadcast_to(as_float(low, friction[1].dtype, "between"), friction[1].shape)
-    return *scene, table, fixed, jnp.stack([lowest, friction[1]])
+    highest = scene.friction[1]
+    lowest = jnp.broadcast_to(as_float(low, highest.dtype, "between"), highest.shape)
+    return scene, jnp.stack([lowest, highest])
 
 
 def shape_of(slider: Slider | tuple[Slider, ...]) -> Shape | tuple[Shape, ...]:

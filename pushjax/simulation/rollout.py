@@ -165,7 +165,8 @@ def rollout(
     `pushjax.simulation.step` has the scheme.
     """
     scene = checked_scene(slider, hand, path, pose, friction, between, solver, table, fixtures)
-    checked = *scene[:5], solver, *scene[5:]
+    slider, hand, path_array, start, mu, table, fixed = scene
+    checked = slider, hand, path_array, start, mu, solver, table, fixed
     return _rollout(*checked) if is_staging() else _rollout_with_padding(*checked)
 
 

@@ -141,7 +141,8 @@ class PushClutter(TableTask):
     def draw_surface(self, key: PRNGKeyArray, params: TableParams) -> LimitSurface:
         """Draw the limit surface of each block, with a leading axis."""
         assert params.surfaces is not None
-        return jax.vmap(lambda one: params.surfaces.sample(one).surface)(jax.random.split(key, self.blocks))
+        sample = params.surfaces.sample
+        return jax.vmap(lambda one: sample(one).surface)(jax.random.split(key, self.blocks))
 
     def goal_coverage(self, state: TaskState, params: TableParams) -> Float[Array, ""]:
         return super().goal_coverage(_of_first(state), params)

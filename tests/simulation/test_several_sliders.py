@@ -212,6 +212,7 @@ def test_random_friction():
     np.testing.assert_allclose([one["x"]["mean"] for one in summary], runs.pose[:, :, 0].mean(axis=0))
     one = pj.random_rollout(jax.random.fold_in(jax.random.key(0), 5), sliders, FINGER, path, **given)
     np.testing.assert_allclose(one.push.pose[-1], runs.pose[5], atol=1e-7)
+    assert one.draws.between is not None
     assert 0.1 <= float(one.draws.between[0, 0, 1]) <= 0.3
     assert len(one.draws.surface) == 2
     np.testing.assert_array_equal(one.draws.surface[1].point[0], sliders[1].surface.point)
