@@ -42,8 +42,8 @@ class FeetForm(NamedTuple):
 
     def table(self) -> NoReturn:
         raise TypeError(
-            "surface: this is for a polynomial limit surface; got the exact one of support points, which `rollout` and "
-            "`step` take without `solver` and `table`. Slider.on(shape, support) fits a polynomial to it"
+            "surface: this is for a polynomial limit surface; got the exact one of support points, which rollouts take "
+            "without `solver` and `table`. Slider.on(shape, support) fits a polynomial to it"
         )
 
     def restrict(self, a: Vec3, b: Vec3) -> NoReturn:

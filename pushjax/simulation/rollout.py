@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, check_type
 from pushjax._internal.jit import is_staging, quick_jit
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, form_and_friction
@@ -50,7 +50,7 @@ MIN_SIZE, SIZE_RATIO = 32, 4  # steps that programs are compiled for: 32, 128, 5
 
 
 def step(
-    slider: Slider,
+    slider: Slider | Sequence[Slider],
     hand: Hand,
     q0: ArrayLike,
     q1: ArrayLike,
@@ -60,6 +60,7 @@ def step(
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
     fixtures: Sequence[Wall | Fixture] = (),
+    between: ArrayLike | None = None,
 ) -> Step:
     """Move the hand from one configuration to another: a rollout of one step, which is divided where it must be.
 
@@ -67,24 +68,35 @@ def step(
     too deep in the slider, and INVALID if a traced value is not finite or a traced friction is negative.
 
     Args:
-        slider: The slider.
+        slider: The slider, or a tuple of several, as in `rollout`.
         hand: The hand.
         q0: Configuration of the hand before the step, (dof,), world, m and rad.
         q1: Configuration of the hand after the step, (dof,), world, m and rad.
-        pose: Pose of the slider before the step, (3,), world, m and rad.
+        pose: Pose of the slider before the step, (3,), world, m and rad; of several, (sliders, 3).
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
         fixtures: Walls and bodies that the slider may touch, as in `rollout`.
+        between: Coefficient of friction of several sliders with each other, as in `rollout`.
 
     Returns:
-        The result of the step.
+        The result of the step. Of several sliders, pose, twist and wrench have an axis for them.
 
     Raises:
         ValueError: For arguments of a wrong shape, and for more contacts than the solver can solve. Where they are not
-            traced, also for values that are not finite, a negative friction, or a hand that is closed on itself.
+            traced, also for values that are not finite, a negative friction, or a hand that is closed on itself. For
+            several sliders as in `rollout`.
         TypeError: For a slider, hand, solver, table or fixture of another type.
     """
+    if isinstance(slider, tuple | list):
+        check_type("hand", hand, Hand)
+        path = [as_float(q, name=name) for name, q in (("q0", q0), ("q1", q1))]
+        for name, q in zip(("q0", "q1"), path, strict=True):
+            check_shape(name, q, (hand.dof,))
+        scene = checked_scene(slider, hand, jnp.stack(path), pose, friction, between, solver, table, fixtures)
+        return _step(scene.slider, scene.hand, *scene.path, scene.start, scene.friction, None, None, scene.fixtures)
+    if between is not None:
+        raise ValueError("between is for several sliders; got one")
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, q0, q1)
     ends = as_float(q0, dtype, "q0"), as_float(q1, dtype, "q1")
     for name, q in zip(("q0", "q1"), ends, strict=True):

@@ -67,8 +67,8 @@ class Slider(eqx.Module):
             shape: Outline, in the body frame.
             support: Pressure under the slider, in the same frame.
             degree: Degree of the limit surface, 2 (an ellipsoid) or 4.
-            exact: Whether to take the exact limit surface of the support in place of a polynomial; `rollout` and `step`
-                take it.
+            exact: Whether to take the exact limit surface of the support in place of a polynomial. `solve_contacts`,
+                other solvers of contact problems, and tables need a polynomial.
 
         Returns:
             The slider. Its limit surface is exact (`Feet`), or fitted to 400 wrench-twist pairs of the support, sampled

@@ -228,6 +228,22 @@ def test_random_friction():
         pj.random_rollout(jax.random.key(0), sliders, FINGER, path, **(given | {"between": (0.3, 0.1)}))
 
 
+@pytest.mark.slow
+def test_a_step_is_a_rollout_of_one_step():
+    poses, path = two_disks(0.0, 0.004)
+    given = {"pose": poses, "friction": FRICTION, "between": BETWEEN}
+    one = pj.step((DISK, DISK), FINGER, path[0], path[2], **given)
+    whole = pj.rollout((DISK, DISK), FINGER, path[:3:2], **given)
+    assert one.pose.shape == (2, 3)
+    assert float(jnp.abs(one.twist[1]).max()) > 1e-4
+    np.testing.assert_allclose(one.pose, whole.pose[-1], atol=1e-12)
+    np.testing.assert_allclose(one.force, whole.force[-1], atol=1e-9)
+    with pytest.raises(ValueError, match="q1"):
+        pj.step((DISK, DISK), FINGER, path[0], (0.0, 0.0, 0.0), **given)
+    with pytest.raises(ValueError, match="between is for several sliders"):
+        pj.step(DISK, FINGER, path[0], path[1], **(given | {"pose": poses[0]}))
+
+
 def test_bodies_of_contacts():
     poses, path = two_disks(0.01, 0.0)
     wall = pj.Wall((0.2, 0.0), (-1.0, 0.0), 0.2)
