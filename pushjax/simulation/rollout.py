@@ -10,6 +10,7 @@ changes nothing.
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -94,19 +95,21 @@ def step(
         for name, q in zip(("q0", "q1"), path, strict=True):
             check_shape(name, q, (hand.dof,))
         scene = checked_scene(slider, hand, jnp.stack(path), pose, friction, between, solver, table, fixtures)
-        return _step(scene.slider, scene.hand, *scene.path, scene.start, scene.friction, None, None, scene.fixtures)
+        before, after = scene.path
+        return _step(scene.slider, scene.hand, before, after, scene.start, scene.friction, None, None, scene.fixtures)
     if between is not None:
         raise ValueError("between is for several sliders; got one")
-    slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, q0, q1)
+    one: Any = slider
+    one, hand, start, mu, dtype = checked_arguments(one, hand, pose, friction, q0, q1)
     ends = as_float(q0, dtype, "q0"), as_float(q1, dtype, "q1")
     for name, q in zip(("q0", "q1"), ends, strict=True):
         check_shape(name, q, (hand.dof,))
         check_finite(name, q)
         check_opening(hand, q)
     check_solver(solver)
-    warn_about_units(slider, start, *ends)
+    warn_about_units(one, start, *ends)
     fixed = checked_fixtures(fixtures, dtype)
-    return _step(slider, hand, *ends, start, mu, solver, checked_table(table, dtype), fixed)
+    return _step(one, hand, *ends, start, mu, solver, checked_table(table, dtype), fixed)
 
 
 @quick_jit
