@@ -1,4 +1,4 @@
-"""A million random control steps of PushT, half of them with each limit surface, in float32, under random friction."""
+"""Half a million random control steps of PushT, half of them with each limit surface, in float32, under random friction."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 import pushjax as pj
 from pushjax.tasks import PushT
 
-BATCH, STEPS = 2048, 250
+BATCH, STEPS = 2048, 125
 
 
 @pytest.mark.slow
@@ -43,6 +43,6 @@ def test_everything_is_finite(degree):
     counts = dict(zip(pj.Status, np.asarray(statuses).sum(0).tolist(), strict=True))
     assert np.all(finite)
     assert sum(counts.values()) == BATCH * STEPS * env.substeps
-    assert counts[pj.Status.JAMMED] > 5_000
+    assert counts[pj.Status.JAMMED] > 2_500
     assert counts[pj.Status.INVALID] == 0
     assert counts[pj.Status.NOT_CONVERGED] < 1e-3 * BATCH * STEPS
