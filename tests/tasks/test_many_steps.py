@@ -1,4 +1,4 @@
-"""Half a million random control steps of PushT, half of them with each limit surface, in float32, under random friction."""
+"""Half a million random control steps of PushT, half with each limit surface, in float32, under random friction."""
 
 import jax
 import jax.numpy as jnp
