@@ -53,10 +53,8 @@ class SlidersFriction(NamedTuple):
         for surface in surfaces:
             form, fingers = form_and_friction(surface, fingers)
             forms.append(form)
-        known = jnp.all(between >= 0)
-        return SlidersFriction(
-            tuple(forms), jnp.where(known, fingers, jnp.nan), jnp.where(jnp.isfinite(between), between, 0.0)
-        )
+        known = jnp.all(jnp.isfinite(between) & (between >= 0))
+        return SlidersFriction(tuple(forms), jnp.where(known, fingers, jnp.nan), jnp.where(known, between, 0.0))
 
 
 class PreparedSliders(NamedTuple):

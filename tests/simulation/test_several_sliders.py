@@ -8,6 +8,7 @@ from compiling import AS_USERS
 
 import pushjax as pj
 from pushjax.geometry.se2_numpy import compose, to_world
+from pushjax.simulation.several_sliders import SlidersFriction
 
 shapely = pytest.importorskip("shapely")
 
@@ -242,6 +243,15 @@ def test_a_step_is_a_rollout_of_one_step():
         pj.step((DISK, DISK), FINGER, path[0], (0.0, 0.0, 0.0), **given)
     with pytest.raises(ValueError, match="between is for several sliders"):
         pj.step(DISK, FINGER, path[0], path[1], **(given | {"pose": poses[0]}))
+
+
+@pytest.mark.parametrize("between", [np.nan, np.inf, -0.1])
+def test_friction_that_is_no_number(between):
+    """It makes every step INVALID, also where it is traced."""
+    given = jnp.full((2, 2), 0.2).at[1, 0].set(between)
+    found = SlidersFriction.of((SURFACE, SURFACE), jnp.array([0.3]), given)
+    assert np.all(np.isnan(found.fingers))
+    assert np.all(np.isfinite(found.between))
 
 
 def test_bodies_of_contacts():
