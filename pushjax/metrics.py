@@ -204,11 +204,11 @@ def _coverage(x: Array, y: Array, scale: Array, levels: Array, min_bandwidth: Ar
     return jnp.mean(observed_log_densities[None] >= thresholds[:, None], axis=1, dtype=sample_log_densities.dtype)
 
 
-def mean_pose(poses: Float[Array, "n 3"]) -> Float[Array, "3"]:
+def mean_pose(poses: Float[Array, "n *sliders 3"]) -> Float[Array, "*sliders 3"]:
     """Return the mean of poses, m and rad: of angles the mean direction, within half a turn of the first angle."""
-    turns = poses[:, 2] - poses[0, 2]
-    angle = poses[0, 2] + jnp.arctan2(jnp.mean(jnp.sin(turns)), jnp.mean(jnp.cos(turns)))
-    return jnp.concatenate([jnp.mean(poses[:, :2], axis=0), angle[None]])
+    turns = poses[..., 2] - poses[:1, ..., 2]
+    angle = poses[0, ..., 2] + jnp.arctan2(jnp.mean(jnp.sin(turns), axis=0), jnp.mean(jnp.cos(turns), axis=0))
+    return jnp.concatenate([jnp.mean(poses[..., :2], axis=0), angle[..., None]], axis=-1)
 
 
 class _Kernel:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 Function = Callable[..., list[Array]]  # of the leaves
 
@@ -132,3 +132,8 @@ batching.primitive_batchers[_with_batch_last_p] = _batching_rule
 ad.primitive_jvps[_with_batch_last_p] = _jvp_rule
 ad.primitive_transposes[_with_batch_last_p] = _transpose_rule
 mlir.register_lowering(_with_batch_last_p, mlir.lower_fun(_call, multiple_results=True))
+
+
+def tree_where_last(condition: Bool[Array, " batch"], a: Any, b: Any) -> Any:
+    """Return `a` where the condition holds, else `b`, for pytrees of arrays with the batch last."""
+    return jax.tree.map(lambda x, y: jnp.where(condition.reshape(*(1,) * (x.ndim - 1), -1), x, y), a, b)

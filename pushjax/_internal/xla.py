@@ -95,14 +95,18 @@ def smallest(values: Float[Array, " values"]) -> Scalar:
 
 
 def map_items(function: Callable, items: tuple) -> tuple:
-    """Return `(function(item), ...)` for pytrees, in a loop if they have the same structure, shapes and dtypes."""
-    # A loop compiles `function` once. Other items are unrolled, which compiles `function` once for every item.
-    # Compilation takes most of the time of a first call.
-    kinds = {
-        (jax.tree.structure(item), *((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(item)))
-        for item in items
-    }
-    if len(items) == 1 or len(kinds) > 1:
-        return tuple(function(item) for item in items)
-    stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
-    return tuple(entry_at(stacked, k) for k in range(len(items)))
+    """Return `(function(item), ...)` for pytrees, in a loop over those of the same structure, shapes and dtypes."""
+    # A loop compiles `function` once. Compilation takes most of the time of a first call.
+    kinds: dict[Any, list[int]] = {}
+    for k, item in enumerate(items):
+        leaves, structure = jax.tree.flatten(item)
+        kind = structure, *((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        kinds.setdefault(kind, []).append(k)
+    results: dict[int, Any] = {}
+    for members in kinds.values():
+        if len(members) == 1:
+            results[members[0]] = function(items[members[0]])
+            continue
+        stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *(items[k] for k in members)))
+        results |= {k: entry_at(stacked, i) for i, k in enumerate(members)}
+    return tuple(results[k] for k in range(len(items)))

@@ -20,13 +20,14 @@ positive work on the motion of the pushers: the contacts jam.
 Reference: Zhou et al. 2017, section IV.B, solves one LCP in each step; Stewart & Trinkle 1996.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from pushjax._internal.trailing_batch import tree_where_last
 from pushjax.contact.lemke import lemke
 from pushjax.contact.linear_patch import LinearPatch
 from pushjax.contact.sliders_problem import LinearLaws, SlidersLCP, SlidersProblem
@@ -42,7 +43,7 @@ LEAST_DECREASE = 0.9  # of the violation from a Newton round to the next, for an
 MAX_FACTOR = 10.0  # of a weight, from a round to the next
 MAX_REFINEMENTS = 6  # Newton steps after the rounds, with the unknowns that may be positive in the best of them
 # Keyed by the bytes of a float: largest violation of a condition of a motion, and where Newton steps end.
-TOLERANCE, ROUNDOFF = {4: 1e-4, 8: 1e-9}, {4: 1e-6, 8: 1e-13}
+TOLERANCE, ROUNDOFF = {4: 1e-4, 8: 1e-9}, {4: 1e-5, 8: 1e-13}
 CERTIFICATE = {4: 1e-3, 8: 1e-6}  # largest wrench that is zero, and least power that is not, of forces of sum one
 
 
@@ -112,18 +113,13 @@ class _State(NamedTuple):
     number: Int[Array, ""]
 
 
-def solve_sliders(
-    problem: SlidersProblem, start: Start | None = None, anew: Bool[Array, ""] | bool = True
+def solve_all(
+    problem: SlidersProblem, start: Start, valid: Bool[Array, " batch"], anew: Bool[Array, ""]
 ) -> SlidersMotion:
-    """Find the motion of several sliders; it is not differentiated. All numbers are zero where they do not move.
-
-    If not `anew`, only Newton steps are made, with the unknowns that may be positive at `start`.
-    """
-    problem, valid = problem.usable()
-    pushes, anew = problem.pushes(), jnp.asarray(anew)
-    if start is None:
-        start = Start.none(problem.count, jnp.zeros_like(problem.rows[0, 0, :, 0]))
-    start = Start(*(jnp.broadcast_to(x, (*x.shape[:-1], *pushes.shape)) for x in start))
+    """The motion of several sliders, given a problem of numbers that can be computed with."""
+    pushes, active = problem.pushes(), problem.active
+    basic = start.basic & jnp.concatenate([active, active, active, jnp.ones_like(start.dissipation, bool)])
+    start = start._replace(force=jnp.where(active, start.force, 0.0), basic=basic)
     before = _motion(problem, start.force, start.dissipation, start.basic, 0, near=start.normal)
     tolerance = TOLERANCE[before.force.dtype.itemsize]
 
@@ -131,10 +127,10 @@ def solve_sliders(
         """Search from the start, then, where that fails, from nothing."""
         found, wanted, number = state
         exists = start.exists & (number == 0)
-        new = _where(anew & wanted, _in_rounds(problem, before, exists & wanted, wanted & anew), before)
+        new = tree_where_last(anew & wanted, _in_rounds(problem, before, exists & wanted, wanted & anew), before)
         new = _refined(problem, new, wanted & (new.status != Status.JAMMED) & (anew | exists))
         is_better = wanted & ((number == 0) | (new.status == Status.JAMMED) | (new.violation < found.violation))
-        found = _where(is_better, new, found)
+        found = tree_where_last(is_better, new, found)
         unsolved = (found.status != Status.JAMMED) & (found.violation > tolerance)
         return found, wanted & exists & unsolved & anew, number + 1
 
@@ -146,7 +142,7 @@ def solve_sliders(
     status = jnp.where(valid, jnp.where(pushes, status, Status.FREE), Status.INVALID).astype(jnp.int8)
     still = jax.tree.map(jnp.zeros_like, found)._replace(mode=jnp.full_like(found.mode, ContactMode.SEPARATED))
     found, still = (x._replace(status=status, violation=found.violation, rounds=found.rounds) for x in (found, still))
-    return _where(status == Status.MOVING, found, still)
+    return tree_where_last(status == Status.MOVING, found, still)
 
 
 def _in_rounds(
@@ -158,7 +154,7 @@ def _in_rounds(
     first = guess._replace(is_newton=exists & False, weight=jnp.ones_like(before.dissipation))
     best = before._replace(violation=infinite, status=jnp.full_like(before.status, Status.NOT_CONVERGED))
     none = jnp.zeros(exists.shape, jnp.int32)
-    start = _State(_where(exists, guess, first), first, none, infinite, best, wanted, jnp.zeros((), jnp.int32))
+    start = _State(tree_where_last(exists, guess, first), first, none, infinite, best, wanted, jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(
         lambda state: jnp.any(state.ongoing) & (state.number < MAX_ROUNDS),
         lambda state: _next_round(problem, mean, state),
@@ -186,14 +182,14 @@ def _next_round(problem: SlidersProblem, mean: Float[Array, "3 3 sliders batch"]
     twist = jnp.sum(laws.law * motion.wrench[None], axis=1)  # of a round of weights
     ellipsoid, by_twist = problem.surface.reweighted(twist, patch.ellipsoid(), weight)
     after = _Round(newton, jnp.where(newton[None], weight, by_twist), motion.wrench, patch, ellipsoid)
-    weights = _where(state.ongoing & found.solved & ~newton, after, state.weights)
+    weights = tree_where_last(state.ongoing & found.solved & ~newton, after, state.weights)
     number = state.weighted + ~newton
     tries_newton = newton | (number & (number - 1) == 0)
-    next_round = _where(goes_on, after._replace(is_newton=tries_newton), weights)
+    next_round = tree_where_last(goes_on, after._replace(is_newton=tries_newton), weights)
     violation = jnp.where(newton, motion.violation, jnp.inf)
     is_better = jams | (motion.violation < state.best.violation)
     ends = jams | (motion.violation <= TOLERANCE[force.dtype.itemsize])
-    best = _where(state.ongoing & is_better, motion, state.best)
+    best = tree_where_last(state.ongoing & is_better, motion, state.best)
     return _State(next_round, weights, number, violation, best, state.ongoing & ~ends, state.number + 1)
 
 
@@ -201,11 +197,6 @@ def _cover(number: Int[Array, ""], q: Float[Array, "rows batch"]) -> Float[Array
     """The covering vector of a round: ones at first, then scattered numbers, to find another one of several answers."""
     scattered = jnp.modf(jnp.arange(1, len(q) + 1, dtype=q.dtype) * (number.astype(q.dtype) * GOLDEN))[0]
     return jnp.where(number < SAME_COVER, 1.0, 0.2 + scattered)
-
-
-def _where(condition: Bool[Array, " batch"], a: Any, b: Any) -> Any:
-    """`a` where the condition holds, else `b`, for pytrees of arrays with the batch last."""
-    return jax.tree.map(lambda x, y: jnp.where(condition.reshape(*(1,) * (x.ndim - 1), -1), x, y), a, b)
 
 
 def _motion(
@@ -265,12 +256,12 @@ def _refined(problem: SlidersProblem, motion: SlidersMotion, wanted: Bool[Array,
 
     def newton_step(state: _Refinement) -> _Refinement:
         lcp, z = _at(problem, state.last, PROXIMAL[item])
-        z = z - _solve_basic(lcp, motion.basic, lcp.complements(z, state.last.patch))
+        z = z - lcp.solve_basic(motion.basic, lcp.complements(z, state.last.patch))
         dissipation = jnp.maximum(lcp.dissipation(z), 0.0)
         force, near = lcp.force(z) * lcp.force_unit[None], state.last.patch.normal
         new = _motion(problem, force, dissipation, motion.basic, motion.rounds, near=near)
         is_better = state.ongoing & (new.violation < state.best.violation)
-        best = _where(is_better, new, state.best)
+        best = tree_where_last(is_better, new, state.best)
         goes_on = (new.violation < state.last.violation / 2) | (best.violation > TOLERANCE[item])
         ongoing = state.ongoing & goes_on & (new.violation > ROUNDOFF[item])
         return _Refinement(new, best, ongoing, state.number + 1)
@@ -296,7 +287,7 @@ def differentiable_motion(problem: SlidersProblem, motion: SlidersMotion) -> Sli
     wrench = problem.wrenches(force)
     twist = dissipation[None] * LinearPatch.at(problem.surface, wrench, motion.patch.normal).normal
     found = motion._replace(twist=twist, wrench=wrench, force=force, dissipation=dissipation)
-    return _where(moves, found, motion)
+    return tree_where_last(moves, found, motion)
 
 
 @eqx.filter_custom_jvp
@@ -324,7 +315,7 @@ def _root_jvp(primals, tangents):
 
     _, change = eqx.filter_jvp(complements, (problem,), (changes,))
     lcp, _ = _at(problem, motion, proximal)
-    return _root(problem, motion, z), -_solve_basic(lcp, motion.basic, change)
+    return _root(problem, motion, z), -lcp.solve_basic(motion.basic, change)
 
 
 def _at(
@@ -340,10 +331,3 @@ def _at(
     lcp = SlidersLCP.of(problem, laws)
     z = lcp.unknowns(motion.force, problem.slips(motion.twist)[1], motion.dissipation)
     return lcp, jnp.where(motion.basic, z, 0.0)
-
-
-def _solve_basic(lcp: SlidersLCP, basic: Bool[Array, "rows batch"], right: Array) -> Float[Array, "rows batch"]:
-    """Solve the rows of the LCP that belong to unknowns that may be positive; zero for the others."""
-    right = jnp.where(basic, right, 0.0)
-    matrix = jnp.where(basic[:, None] & basic[None], lcp.matrix, jnp.eye(len(basic), dtype=right.dtype)[:, :, None])
-    return jnp.linalg.solve(jnp.moveaxis(matrix, -1, 0), right.T[:, :, None])[:, :, 0].T

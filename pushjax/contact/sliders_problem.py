@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from pushjax.contact.linear_patch import LinearPatch, Surface
@@ -55,9 +56,12 @@ class SlidersProblem(NamedTuple):
         surface, finite = self.surface.usable()
         own = jnp.isfinite(jnp.sum(self.rows, axis=(0, 1, 2)) + jnp.sum(self.goal, axis=0) + self.friction)
         valid = finite & jnp.all((own & (self.friction >= 0)) | ~self.active, axis=0)
-        active = self.active & valid[None]
+        return self._replace(surface=surface).of_contacts(self.active & valid[None]), valid
+
+    def of_contacts(self, active: Bool[Array, "contacts batch"]) -> "SlidersProblem":
+        """The problem with these contacts alone; the numbers of the others are zero."""
         rows, goal = (jnp.where(jnp.expand_dims(active, tuple(range(x.ndim - 2))), x, 0.0) for x in self[1:3])
-        return SlidersProblem(surface, rows, goal, jnp.where(active, self.friction, 0.0), active), valid
+        return SlidersProblem(self.surface, rows, goal, jnp.where(active, self.friction, 0.0), active)
 
 
 class LinearLaws(NamedTuple):
@@ -146,3 +150,23 @@ class SlidersLCP(NamedTuple):
         left = z[2 * problem.count : 3 * problem.count]
         rest = problem.friction * force[0] - force[1]
         return jnp.concatenate([slip[0], slip[1] + left, rest, (1 - patch.gauge) * self.speed_unit])
+
+    def solve_basic(self, basic: Bool[Array, "rows batch"], right: Array) -> Float[Array, "rows batch"]:
+        """Solve the rows of the LCP that belong to unknowns that may be positive; zero for the others."""
+        count, mu = self.problem.count, self.problem.friction
+        right = jnp.where(basic, right, 0.0)
+        # Where u_L may be positive, f_R = 2 mu f_n - (right side of the row of f_L). This and u_L are put in by hand.
+        left = basic[count : 2 * count] & basic[2 * count : 3 * count]
+        rest = jnp.where(left, right[2 * count : 3 * count], 0.0)
+        rows = np.r_[: 2 * count, 3 * count : len(basic)]
+        wanted = basic[rows].at[count : 2 * count].set(basic[count : 2 * count] & ~left)
+        matrix = self.matrix[rows][:, rows]
+        by_right = matrix[:, count : 2 * count]
+        reduced = matrix.at[:, :count].add(jnp.where(left, 2 * mu, 0.0)[None] * by_right)
+        reduced = jnp.where(wanted[:, None] & wanted[None], reduced, jnp.eye(len(rows), dtype=right.dtype)[:, :, None])
+        known = jnp.where(wanted, right[rows] + jnp.sum(by_right * rest[None], axis=1), 0.0)
+        found = jnp.linalg.solve(jnp.moveaxis(reduced, -1, 0), known.T[:, :, None])[:, :, 0].T
+        force = jnp.where(left, 2 * mu * found[:count] - rest, found[count : 2 * count])
+        found = found.at[count : 2 * count].set(force)
+        slip = right[count : 2 * count] - jnp.sum(matrix[count : 2 * count] * found[None], axis=1)
+        return jnp.concatenate([found[: 2 * count], jnp.where(left, slip, 0.0), found[2 * count :]])

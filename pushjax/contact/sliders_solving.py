@@ -19,7 +19,8 @@ from pushjax._internal.xla import tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.linear_patch import MixedSurfaces, Surface
-from pushjax.contact.several_sliders import SlidersMotion, Start, differentiable_motion, solve_sliders
+from pushjax.contact.near_contacts import solve_sliders
+from pushjax.contact.several_sliders import SlidersMotion, Start, differentiable_motion
 from pushjax.contact.sliders_problem import SlidersProblem
 from pushjax.contact.status import ContactMode, Status
 from pushjax.friction.feet import FeetForm
@@ -28,7 +29,7 @@ from pushjax.friction.polynomial import Polynomial
 from pushjax.friction.support_points import SupportPoints
 
 # Problems that a CPU solves at once, times their contacts, so that tableaus stay in the cache; and the fewest problems.
-TILE, LEAST_TILE = 64, 8
+TILE, LEAST_TILE = 128, 16
 
 
 class Touching(NamedTuple):

@@ -61,7 +61,7 @@ def parse_fixture(text: str, friction: float) -> pj.Wall | pj.Fixture:
         return pj.Wall((x, y), (math.cos(angle), math.sin(angle)), friction=friction)
     shape = parse_shape(kind, "--fixtures")
     if isinstance(shape, pj.Ellipse):
-        raise ValueError(f"--fixtures: a body is a disk or a convex polygon; got {text!r}")
+        raise ValueError(f"--fixtures: a body is a disk or a polygon; got {text!r}")
     return pj.Fixture(shape, (x, y, angle), friction=friction)
 
 

@@ -46,6 +46,26 @@ def inside(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.sum(spans & crosses, axis=0) % 2 == 1
 
 
+def triangles(vertices: np.ndarray) -> list[np.ndarray]:
+    """Divide a polygon without crossing edges into triangles, each (3, 2), by cutting off one ear after the other."""
+    rest, found, roundoff = list(vertices), [], 1e-6 * np.ptp(vertices)
+    while len(rest) > 2:
+        # of all ears, the one with the largest angle at its tip, so that no triangle is thinner than need be
+        ears = []
+        for k in range(len(rest)):
+            ear = np.array([rest[k - 1], rest[k], rest[(k + 1) % len(rest)]])
+            back, onward = ear[0] - ear[1], ear[2] - ear[1]
+            turn = onward[0] * back[1] - onward[1] * back[0]
+            others = np.array([rest[(k + j) % len(rest)] for j in range(2, len(rest) - 1)]).reshape(-1, 2)
+            is_flat = abs(turn) <= roundoff**2  # the tip is on the line between its neighbors
+            if is_flat or (turn > 0 and np.all(signed_distances(ear, others) > roundoff)):
+                ears.append((np.arctan2(turn, onward @ back), k, [] if is_flat else [ear]))
+        _, tip, ear = max(ears, key=lambda each: each[:2])
+        found += ear
+        del rest[tip]
+    return found
+
+
 def segment_distances(
     vertices: np.ndarray,
     start: np.ndarray,

@@ -7,9 +7,11 @@ samples that the finger would touch are counted.
 
 A transit ends in a run-up: from where the finger has its full distance, straight ahead to where the push starts.
 
-Fixtures are where they are known to be: the finger keeps its clearance from them, and no more.
+Fixtures are where they are known to be: the finger keeps its clearance from them, and no more. It keeps no more from
+other sliders either, but samples in which it would touch one are counted.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,30 +54,37 @@ class FingerMotion(NamedTuple):
 
 
 def transits_between(
-    vertices: np.ndarray,  # (vertices, 2), of the slider, counterclockwise, body frame, m
+    outlines: Sequence[np.ndarray],  # (vertices, 2) of each slider, counterclockwise, body frame, m
     radius: float,  # of the finger, m
-    clearance: float,  # that the finger keeps from slider and fixtures, m
+    clearance: float,  # that the finger keeps from sliders and fixtures, m
     paths: np.ndarray,  # (pushes, steps + 1, 2), world, m
-    predicted: np.ndarray,  # (pushes + 1, 3), slider poses before the first push and after each, world, m and rad
-    samples: np.ndarray,  # (samples, pushes + 1, 3), of these poses
+    predicted: np.ndarray,  # (pushes + 1, sliders, 3), poses before the first push and after each, world, m and rad
+    samples: np.ndarray,  # (samples, pushes + 1, sliders, 3), of these poses
     start: np.ndarray | None = None,  # (2,), of the finger, world, m; None: where the first run-up begins
     fixtures: Fixtures = (),
+    pushed: Sequence[int] | np.ndarray | None = None,  # index of the slider that each push is made on; None: the first
 ) -> Transits:
     """Find the transits of a finger to the start of each push, and away from the slider after the last one."""
     # There are none if there is neither a push nor a start.
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
     if start is None and not len(paths):
         return Transits((), np.zeros(len(samples), bool))
-    around = _Surroundings(vertices, radius, clearance, Obstacles.of(fixtures))
+    fixed = Obstacles.of(fixtures)
     transits, touched = [], np.zeros(len(samples), bool)
     origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
-    for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
-        scatter = _displacement(vertices, pose, samples[:, k])
+    # the last retreat is from the slider of the last push
+    ones = [0] * len(origins) if pushed is None or not len(pushed) else [*pushed, pushed[-1]]
+    for k, (poses, origin, one) in enumerate(zip(predicted, origins, ones, strict=True)):
+        # the other sliders are obstacles, which stay where they are predicted to be
+        others = [to_world(poses[j], each) for j, each in enumerate(outlines) if j != one]
+        around = _Surroundings(outlines[one], radius, clearance, fixed._replace(bodies=(*fixed.bodies, *others)))
+        scatter = _displacement(outlines[one], poses[one], samples[:, k, one])
         margins = [*(clearance + np.quantile(scatter, q) for q in QUANTILES), clearance, TIGHT * clearance]
         for margin in margins:  # the last attempt is the least demanding, and tells why there is none
-            transit = _transit(around, margin, paths[k : k + 1], pose, origin)
+            transit = _transit(around, margin, paths[k : k + 1], poses[one], origin)
             if transit.status == TransitStatus.FOUND:
-                touched |= _touches(vertices, radius, transit.points, samples[:, k])
+                for j, vertices in enumerate(outlines):
+                    touched |= _touches(vertices, radius, transit.points, samples[:, k, j])
                 break
         transits.append(transit)
     return Transits(tuple(transits), touched)

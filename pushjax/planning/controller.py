@@ -286,7 +286,7 @@ class PushController:
     ) -> np.ndarray:
         """Return the poses of the slider after pushes from one position to each of the ends, (ends, 3)."""
         paths = position + (ends - position)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
-        slider, friction = self.scene.slider, self.scene.mean_friction
+        slider, friction = self.scene.one_slider, self.scene.mean_friction
         if belief is not None:
             surface, mu = _mean(belief)
             slider, friction = Slider(slider.shape, surface), float(mu)

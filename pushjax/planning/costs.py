@@ -4,8 +4,9 @@ A `Cost` is a function of a `Trajectory`. Costs add up and are multiplied by num
 
     cost = Missed(goal, width=0.5) + 0.001 * FinalPose(goal)
 
-The trajectory of several pushes in a row has a leading axis of pushes, and every cost takes it as it is. A cost is a
-pure function. Its derivatives are finite wherever those of the trajectory are.
+The trajectory of several pushes in a row has a leading axis of pushes, and every cost takes it as it is. Of several
+sliders, the goal is that of the first one. A cost is a pure function. Its derivatives are finite wherever those of the
+trajectory are.
 
 The friction of a push is random, and so is the pose from which it starts. Samples of both give samples of the cost,
 which a `Risk` reduces to one number.
@@ -66,8 +67,9 @@ class Scaled(Cost):
 
 
 def _final_pose(push: Trajectory) -> Float[Array, "3"]:
-    """Return the final pose of a push, or of the last of several pushes in a row."""
-    return push.pose.reshape(-1, 3)[-1]
+    """Return the final pose of a push, or of the last of several pushes in a row; that of the first slider."""
+    of_several = push.pose.ndim > push.status.ndim + 1
+    return (push.pose[..., 0, :] if of_several else push.pose).reshape(-1, 3)[-1]
 
 
 class FinalPose(Cost):

@@ -106,14 +106,14 @@ class FrictionFilter(eqx.Module):
         numbers = {"effective": effective, "error": error, "relative_error": relative_error}
         for name, value in numbers.items():
             sign = {"non_negative" if name == "relative_error" else "positive": True}
-            setattr(self, name, checked_array(name, value, (), scene.slider.surface.length.dtype, **sign))
+            setattr(self, name, checked_array(name, value, (), scene.one_slider.surface.length.dtype, **sign))
         known = concrete(self.effective)
         if known is not None and not 1 <= known <= samples:
             raise ValueError(f"effective must be from 1 to the number of samples, {samples}; got {effective!r}")
 
     def init(self, key: PRNGKeyArray) -> FrictionBelief:
         """Draw samples, with equal weights, which are those of `PushLibrary.build` with this key."""
-        draws = draw_friction(key, self.scene.slider.surface, self.scene.friction, self.samples)
+        draws = draw_friction(key, self.scene.one_slider.surface, self.scene.friction, self.samples)
         surface, friction = jax.tree.map(lambda leaf: leaf[:, 0], (draws.surface, draws.friction))
         weight = jnp.full((self.samples,), 1 / self.samples, self.error.dtype)
         status = jnp.asarray(BeliefStatus.PRIOR, jnp.int32)
@@ -174,7 +174,7 @@ def _squared_errors(
     settings: FrictionFilter, belief: FrictionBelief, before: Array, path: Array, after: Array
 ) -> Float[Array, "samples"]:
     """Return the squared pose error of the simulation under each sample, in scales of the error."""
-    slider, length = settings.scene.slider, settings.scene.slider.surface.length
+    slider, length = settings.scene.one_slider, settings.scene.one_slider.surface.length
     scale = settings.error**2 + settings.relative_error**2 * _distance_squared(before, after, length)
 
     def squared_error(surface: LimitSurface, mu: Array) -> Float[Array, ""]:

@@ -1,6 +1,6 @@
 """Distances of fingers and sliders from walls and fixed bodies, in NumPy, for planners.
 
-Fixed bodies are convex polygons and disks.
+Fixed bodies are disks and convex polygons; another polygon is divided into triangles.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pushjax.geometry.disk import Disk
-from pushjax.geometry.polygon_numpy import segment_distances, signed_distances
+from pushjax.geometry.polygon_numpy import segment_distances, signed_distances, triangles
 from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.simulation.arguments import checked_fixtures
 from pushjax.simulation.fixtures import Fixture, Wall
@@ -39,7 +39,8 @@ class Obstacles(NamedTuple):
             if isinstance(each.shape, Disk):
                 disks.append((each.center.x, each.center.y, each.shape.radius))
             else:
-                bodies.append(to_world(np.asarray(each.pose, float), np.asarray(each.shape.vertices, float)))
+                placed = to_world(np.asarray(each.pose, float), np.asarray(each.shape.vertices, float))
+                bodies += [placed] if each.shape.convex else triangles(placed)
         centers, radii = np.split(np.array(disks, float).reshape(-1, 3), [2], axis=1)
         return Obstacles(tuple(bodies), points, normals, centers, radii[:, 0])
 

@@ -239,7 +239,7 @@ def fan(
     if not 0 <= max_angle < np.pi / 2:
         raise ValueError(f"max_angle must be at least 0 and less than pi / 2; got {max_angle!r}")
     distance = scene.radius + GAP * scene.length
-    curve = offset_curve(outline_vertices(scene.slider.shape), distance, contacts)
+    curve = offset_curve(outline_vertices(scene.one_slider.shape), distance, contacts)
     angle = np.linspace(-max_angle, max_angle, angles) if angles > 1 else np.zeros(1)
     (x, y), c, s = curve.normals.T[..., None], np.cos(angle), np.sin(angle)
     directions = np.stack([c * x - s * y, s * x + c * y], axis=-1).reshape(-1, 2)
@@ -255,7 +255,7 @@ def _simulated(
     name: str,  # digest of all this
 ) -> PushLibrary:
     """Simulate straight pushes."""
-    slider, length = scene.slider, scene.length
+    slider, length = scene.one_slider, scene.length
     steps = round(TRAVEL / STEP)
     travel = length * STEP * np.arange(steps + 1)
     paths = starts[:, None] + travel[:, None] * directions[:, None]

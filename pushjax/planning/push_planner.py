@@ -89,7 +89,7 @@ class PushPlanner:
         library.check_made_for(scene)
         self.scene, self.library_samples, self.miss_cost = scene, library, miss_cost
         self.goal, self.workspace, self.speeds = np.asarray(goal, float), workspace, speeds
-        self.vertices, length = outline_vertices(scene.slider.shape), library.length
+        self.vertices, length = outline_vertices(scene.one_slider.shape), library.length
         workspace.check_goal(self.goal, self.vertices)
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
         self.look_ahead, self.use_cost_to_go = look_ahead, use_cost_to_go

@@ -36,6 +36,7 @@ from pushjax.planning.push_sequence import PushSequence
 from pushjax.planning.roadmap import Transit, TransitStatus
 from pushjax.planning.scene import PushScene
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
+from pushjax.simulation.arguments import check_start_beside_each_other
 from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.slider import fixture_overlaps
 
@@ -52,11 +53,13 @@ class PushPlan(NamedTuple):
     Attributes:
         status: Whether it is sure enough.
         path: Paths of the hand, (pushes, steps + 1, dof), world. Pushes that move the slider in no sample are left out.
-        pose: Poses of the slider under the mean friction, before the first push and after each, (pushes + 1, 3), world.
+        pose: Poses of the slider under the mean friction, before the first push and after each, (pushes + 1, 3), world;
+            of several sliders (pushes + 1, sliders, 3).
         transits: Transits of the finger to the start of each push, and its last retreat, (pushes + 1). Empty for other
             hands.
         parameters: Its parameters, as in `PushSequence`, (size,), also of pushes that are left out.
         outcomes: Predicted poses under friction that the search has not seen, as of `push_outcomes`.
+        pushed: Index of the slider that each push is made on, (pushes,).
         success: Predicted probability of success: the fraction of these samples that reach the goal, and that the
             finger does not touch between pushes. Zero for a plan that cannot be carried out.
         cost: Its cost in the search.
@@ -69,6 +72,7 @@ class PushPlan(NamedTuple):
     transits: tuple[Transit, ...]
     parameters: np.ndarray
     outcomes: Outcomes
+    pushed: np.ndarray
     success: float
     cost: float
     history: np.ndarray
@@ -92,15 +96,19 @@ def plan_pushes(
 ) -> PushPlan:
     """Plan pushes that bring a slider to a goal, as surely as can be under friction that is not known.
 
+    Of several sliders, the first one is brought to the goal. They push each other, and pushes may be made on any of
+    those that `pushes` names.
+
     The same arguments give the same bits. All candidates share their sampled friction.
 
     Args:
         key: PRNG key of everything random.
-        scene: Slider, hand (of round fingers), friction and fixtures. The slider may run into fixtures, and then moves
-            as in a simulation; the hand stays out of them, in pushes and, if it is one finger, between them.
-        start: Pose of the slider at the start, (3,), world, m and rad, or samples of a belief, (poses, 3). Sample k of
-            the friction starts at pose k modulo the number of poses. So of more poses than samples only the first are
-            used, `samples` in the search and 256 in the prediction.
+        scene: Slider or several, hand (of round fingers), friction and fixtures. A slider may run into fixtures, and
+            then moves as in a simulation; the hand stays out of them, in pushes and, if it is one finger, between them.
+        start: Pose of the slider at the start, (3,), world, m and rad, or samples of a belief, (poses, 3); of several
+            sliders (sliders, 3) or (poses, sliders, 3). Sample k of the friction starts at pose k modulo the number of
+            poses. So of more poses than samples only the first are used, `samples` in the search and 256 in the
+            prediction.
         goal: The goal.
         pushes: How many pushes, and what is free in each.
         cost: Cost of a push; by default, `Missed` with a smooth transition and a thousandth of the squared error.
@@ -118,8 +126,9 @@ def plan_pushes(
 
     Raises:
         ValueError: For a count below one, a start that is not finite or of another shape, a success outside [0, 1], a
-            finger in the slider or in a fixture or for another hand, a start or a goal at which the slider overlaps a
-            fixture, or a hand that does not fit `pushes`.
+            finger in the slider or in a fixture or for another hand, a start at which sliders overlap, a start or a
+            goal at which the slider overlaps a fixture, a hand that does not fit `pushes`, or pushes on sliders that
+            are not in the scene.
         TypeError: For arguments of other types, and for a hand with pads.
     """
     check_type("goal", goal, Goal)
@@ -129,6 +138,8 @@ def plan_pushes(
         raise ValueError(f"success must be a probability; got {success!r}")
     check_type("scene", scene, PushScene)
     pushes.check_hand(scene.hand)
+    if max(pushes.sliders) >= len(scene.sliders):
+        raise ValueError(f"pushes.sliders is {pushes.sliders}; the scene has {len(scene.sliders)} slider(s)")
     cost = Missed(goal, MISSED_WIDTH) + 0.001 * FinalPose(goal) if cost is None else cost
     risk = Mean() if risk is None else risk
     if scene.fixtures:
@@ -178,14 +189,16 @@ def _predicted(
     """Predict where a candidate ends under unseen friction, and find the transits of the finger between its pushes."""
     paths, poses = lay_out(parameters[None], problem)
     _, found = samples_of(paths, unseen)
-    path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(found.poses[0], found.failed[0]))
+    path, poses, outcomes, moves = _without_idle(paths[0], poses[0], Outcomes(found.poses[0], found.failed[0]))
+    pushed = problem.pushes.pushed(parameters)[moves]
     good = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed)
     transits, has_transits = (), True
     if (scene := problem.scene).has_one_finger:
-        vertices, clearance = outline_vertices(scene.slider.shape), float(problem.pushes.clearance)
-        samples = np.asarray(outcomes.poses)
-        radius = float(scene.hand.radius[0])
-        between = transits_between(vertices, radius, clearance, path, poses, samples, finger, scene.fixtures)
+        outlines = [outline_vertices(slider.shape) for slider in scene.sliders]
+        each, samples = poses.reshape(len(poses), -1, 3), np.asarray(outcomes.poses)
+        samples = samples.reshape(*samples.shape[:2], -1, 3)
+        given = outlines, float(scene.hand.radius[0]), float(problem.pushes.clearance), path, each, samples
+        between = transits_between(*given, finger, scene.fixtures, pushed)
         good, transits = good & ~between.touched, between.transits
         has_transits = between.status == TransitStatus.FOUND
     hits = _hand_in_fixture(problem, path)
@@ -193,15 +206,17 @@ def _predicted(
     status = PlanStatus.FOUND if probability >= success else PlanStatus.UNLIKELY
     status = status if has_transits else PlanStatus.NO_TRANSIT
     status = PlanStatus.HAND_IN_FIXTURE if hits else status
-    return PushPlan(status, path, poses, transits, parameters, outcomes, probability, cost, np.zeros(0))
+    return PushPlan(status, path, poses, transits, parameters, outcomes, pushed, probability, cost, np.zeros(0))
 
 
-def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray, Outcomes]:
-    """Leave out the pushes that move the slider in no sample, nor under the mean friction."""
+def _without_idle(
+    path: np.ndarray, poses: np.ndarray, outcomes: Outcomes
+) -> tuple[np.ndarray, np.ndarray, Outcomes, np.ndarray]:
+    """Leave out the pushes that move a slider in no sample, nor under the mean friction; and return which are left."""
     every = np.concatenate([poses[None], np.asarray(outcomes.poses)])
-    moves = np.any(np.diff(every, axis=1) != 0, axis=(0, 2))
+    moves = np.any(np.diff(every, axis=1) != 0, axis=(0, *range(2, every.ndim)))
     keep = np.concatenate([[True], moves])
-    return path[moves], poses[keep], outcomes._replace(poses=outcomes.poses[:, keep])
+    return path[moves], poses[keep], outcomes._replace(poses=outcomes.poses[:, keep]), moves
 
 
 def _hand_in_fixture(problem: PushProblem, path: np.ndarray) -> bool:
@@ -213,14 +228,15 @@ def _hand_in_fixture(problem: PushProblem, path: np.ndarray) -> bool:
 
 
 def _check_poses(problem: PushProblem, goal: Goal) -> None:
-    """Raise an error if the slider overlaps a fixture at the start, or at the goal."""
-    slider, fixtures, length = problem.scene.slider, problem.scene.fixtures, problem.scene.length
+    """Raise an error if a slider overlaps another one or a fixture at the start, or the first a fixture at the goal."""
+    sliders, fixtures, length = problem.scene.sliders, problem.scene.fixtures, problem.scene.length
+    starts = problem.start.reshape(-1, len(sliders), 3)
+    check_start_beside_each_other(sliders, starts[0] if (starts == starts[:1]).all() else starts, "start")
     if not fixtures:
         return
-    for name, poses, allowed in (
-        ("start", problem.start, MAX_PENETRATION * length),  # a rollout pushes out what overlaps less
-        ("goal", goal.pose[None], OVERLAP_TOLERANCE * length),
-    ):
+    # a rollout pushes out what overlaps less
+    checks = [("start", slider, starts[:, k], MAX_PENETRATION * length) for k, slider in enumerate(sliders)]
+    for name, slider, poses, allowed in [*checks, ("goal", sliders[0], goal.pose[None], OVERLAP_TOLERANCE * length)]:
         depth = np.asarray(fixture_overlaps(slider, fixtures, poses.astype(problem.start.dtype)))
         if depth.max() > allowed:
             raise ValueError(
@@ -237,12 +253,11 @@ def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarra
         raise ValueError("finger is for a hand of one finger; this hand has another configuration")
     given = checked_array("finger", finger, (2,), problem.start.dtype)
     center, radius = np.asarray(given, float), problem.scene.hand.radius[0]
-    in_body = to_body(np.asarray(mean_pose(problem.start), float), center)
-    apart = {
-        "the slider": signed_distances(outline_vertices(problem.scene.slider.shape), in_body),
-        "a fixture": Obstacles.of(problem.scene.fixtures).point_clearance(center),
-    }
-    for name, distance in apart.items():
+    poses = np.asarray(mean_pose(problem.start), float).reshape(-1, 3)
+    apart = [("a fixture", Obstacles.of(problem.scene.fixtures).point_clearance(center))]
+    for slider, pose in zip(problem.scene.sliders, poses, strict=True):
+        apart.append(("the slider", signed_distances(outline_vertices(slider.shape), to_body(pose, center))))
+    for name, distance in apart:
         if (overlap := float(radius - distance)) > 0:
             raise ValueError(f"finger must not overlap {name} at the start; got an overlap of {overlap:.3g} m")
     return center

@@ -26,7 +26,8 @@ from pushjax.planning.push_batch import in_batches
 from pushjax.planning.push_sequence import PushSequence
 from pushjax.planning.scene import PushScene, draw_friction, mean_friction
 from pushjax.planning.search import Objective
-from pushjax.simulation.random_rollout import Draws, rollout_under_draws
+from pushjax.simulation.random_rollout import Draws, rollout_under_draws, shape_and_surface
+from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
 FAILURE = 1e3  # cost of a rollout that fails, such as a push that would start inside the slider
@@ -37,13 +38,14 @@ SAMPLES_AT_A_TIME = 2048  # samples that are simulated together, so that their d
 class Outcomes(NamedTuple):
     """Where pushes end under sampled friction."""
 
-    poses: Float[Array, "samples pushes+1 3"]  # of the slider before the first push and after each, world
+    poses: Float[Array, "samples pushes+1 *sliders 3"]  # before the first push and after each, world
     failed: Bool[Array, "samples"]  # whether a rollout failed
 
     @property
     def pose(self) -> Float[Array, "samples 3"]:
-        """Final poses of the slider, (samples, 3), world."""
-        return self.poses[:, -1]
+        """Final poses of the slider, of several the first one, (samples, 3), world."""
+        last = self.poses[:, -1]
+        return last if last.ndim == 2 else last[:, 0]
 
     def success(self, goal: Goal) -> float:
         """Return the fraction of the samples that reach a goal."""
@@ -55,18 +57,20 @@ class PushProblem(eqx.Module):
 
     pushes: Any  # `PushSequence`; None where nothing is searched, as for cost and risk
     scene: PushScene
-    start: Float[Array, "samples 3"]  # of the slider, world, m and rad
+    start: Float[Array, "samples *sliders 3"]  # world, m and rad
     mean: Draws  # friction under which the slider is moved to where the path of each later push is laid out
     draws: Draws  # sampled friction, one for each start
     cost: Any  # `Cost` of one sample
     risk: Any  # `Risk` of the costs of all samples
 
-    def lay_out(self, parameters: Array) -> tuple[Float[Array, "pushes steps+1 dof"], Float[Array, "pushes+1 3"]]:
+    def lay_out(
+        self, parameters: Array
+    ) -> tuple[Float[Array, "pushes steps+1 dof"], Float[Array, "pushes+1 *sliders 3"]]:
         """Return the paths of all pushes, and the poses before the first and after each, under the mean friction."""
         draw = jax.tree.map(lambda leaf: leaf[0], self.mean)
 
         def push(pose: Array, numbers: Array) -> tuple[Array, tuple[Array, Array]]:
-            path = self.pushes.path(numbers, self.scene.slider, self.scene.hand, pose)
+            path = self.pushes.path(numbers, self.scene.sliders, self.scene.hand, pose.reshape(-1, 3))
             after = self.rollout(draw, path, pose).pose[-1]
             return after, (path, after)
 
@@ -76,7 +80,7 @@ class PushProblem(eqx.Module):
 
     def rollout(self, draw: Draws, path: Array, pose: Array) -> Trajectory:
         """Push once under sampled friction."""
-        shape, hand, fixtures = self.scene.slider.shape, self.scene.hand, self.scene.fixtures
+        (shape, _), hand, fixtures = shape_and_surface(self.scene.slider), self.scene.hand, self.scene.fixtures
         return rollout_under_draws(draw, shape, hand, path, pose, None, None, None, fixtures)
 
     def sample(self, paths: Array, draw: Draws, pose: Array) -> tuple[Float[Array, ""] | None, Outcomes]:
@@ -136,16 +140,17 @@ def push_outcomes(
 
     Args:
         key: PRNG key of everything random.
-        scene: Slider, hand, friction, and the fixtures that the slider may run into. The hand is put at the start of
-            each path, wherever it was before.
+        scene: Slider or several, hand, friction, and the fixtures that sliders may run into. The hand is put at the
+            start of each path, wherever it was before.
         start: Pose of the slider at the start, (3,), or samples of a belief, (poses, 3), world, m and rad. Sample k
-            starts at pose k modulo the number of poses.
+            starts at pose k modulo the number of poses. Of several sliders (sliders, 3) or (poses, sliders, 3).
         path: Paths of the hand, (pushes, steps + 1, dof), world.
         samples: Number of samples.
 
     Returns:
-        `poses` before the first push and after each, (samples, pushes + 1, 3), and whether a rollout `failed`,
-        (samples,). The final ones are `pose`, and `success(goal)` is the fraction that reaches a goal.
+        `poses` before the first push and after each, (samples, pushes + 1, 3), of several sliders (samples, pushes + 1,
+        sliders, 3), and whether a rollout `failed`, (samples,). The final ones of the first slider are `pose`, and
+        `success(goal)` is the fraction that reaches a goal.
 
     Raises:
         ValueError: For a count below one, and for a start or paths that are not finite or of another shape.
@@ -167,14 +172,19 @@ def push_problem(
     check_type("scene", scene, PushScene)
     dtype = common_dtype(scene.slider, scene.hand, start)
     poses = as_float(start, dtype, "start")
-    if poses.ndim not in (1, 2) or poses.shape[-1] != 3 or not poses.size:
-        raise ValueError(f"start has shape {poses.shape}; expected (3,) or (poses, 3)")
+    of_one, many = ((3,), "(poses, 3)")
+    if not isinstance(scene.slider, Slider):
+        of_one, many = (len(scene.sliders), 3), f"(poses, {len(scene.sliders)}, 3)"
+    if poses.shape[-len(of_one) :] != of_one or poses.ndim > len(of_one) + 1 or not poses.size:
+        raise ValueError(f"start has shape {poses.shape}; expected {of_one} or {many}")
     check_finite("start", poses)
-    surface, model = scene.slider.surface, scene.friction
-    draws = draw_friction(key, surface, model, samples)
-    poses = poses.reshape(-1, 3)[np.arange(samples) % (poses.size // 3)]
+    _, surface = shape_and_surface(scene.slider)
+    draws = draw_friction(key, surface, scene.friction, samples, scene.between)
+    poses = poses.reshape(-1, *of_one)
+    poses = poses[np.arange(samples) % len(poses)]
     pushes, cost, risk = criteria or (None, None, None)
-    problem = PushProblem(pushes, scene, poses, mean_friction(surface, model), draws, cost, risk)
+    mean = mean_friction(surface, scene.friction, scene.between)
+    problem = PushProblem(pushes, scene, poses, mean, draws, cost, risk)
     return jax.tree.map(lambda leaf: leaf.astype(dtype), problem)
 
 

@@ -6,11 +6,13 @@ goes on from there by a length. So contact point, direction and length are free,
 between its edges. With bends the path is a Bezier curve whose ends are those of the line.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.special import binom
 
 from pushjax._internal.checks import ArrayLike, check_count, checked_array
@@ -30,7 +32,8 @@ class PushSequence(eqx.Module):
     - direction, rad, in the slider's body frame at the start of the push;
     - distance of the line from the body origin to the left, in units of the slider's radius about its origin;
     - length of the push from first contact, in units of `length`, clipped to [0, 1];
-    - sideways displacement of each inner control point, in units of the push's length.
+    - sideways displacement of each inner control point, in units of the push's length;
+    - if there is a choice, which slider it is made on: the whole part is an index of `sliders`.
 
     A push of length zero ends where the hand touches, so a plan of three pushes contains those of fewer.
 
@@ -42,14 +45,18 @@ class PushSequence(eqx.Module):
         bends: Number of inner control points of the path; zero for a straight line.
         opening: For a hand that turns: what its configuration has beyond x, y and theta, (dof - 3,). The x axis of such
             a hand points in the direction of the push.
+        sliders: In a scene of several, the indices of those that a push may be made on. By default only the first, of
+            which the goal is.
 
     Raises:
-        ValueError: For a count below one, a negative number of bends, or a length or clearance that is not positive.
+        ValueError: For a count below one, a negative number of bends, a length or clearance that is not positive, or
+            `sliders` that are empty or no indices.
     """
 
     count: int = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     bends: int = eqx.field(static=True)
+    sliders: tuple[int, ...] = eqx.field(static=True)
     length: Float[Array, ""]
     clearance: Float[Array, ""]
     opening: Float[Array, "numbers"]
@@ -63,12 +70,16 @@ class PushSequence(eqx.Module):
         clearance: ArrayLike = 0.01,
         bends: int = 0,
         opening: ArrayLike = (),
+        sliders: Sequence[int] = (0,),
     ):
         check_count("count", count)
         check_count("steps", steps)
         if not isinstance(bends, (int, np.integer)) or isinstance(bends, bool) or bends < 0:
             raise ValueError(f"bends must be a whole number, at least 0; got {bends!r}")
+        if not len(sliders) or any(not isinstance(k, (int, np.integer)) or k < 0 for k in sliders):
+            raise ValueError(f"sliders must be indices of sliders, at least one; got {sliders!r}")
         self.count, self.steps, self.bends = int(count), int(steps), int(bends)
+        self.sliders = tuple(int(k) for k in sliders)
         self.length = checked_array("length", length, (), positive=True)
         self.clearance = checked_array("clearance", clearance, (), positive=True)
         self.opening = checked_array("opening", opening, ("numbers",))
@@ -76,17 +87,28 @@ class PushSequence(eqx.Module):
     @property
     def size(self) -> int:
         """Number of parameters of all pushes."""
-        return self.count * (3 + self.bends)
+        return len(self.scale)
 
     @property
     def scale(self) -> np.ndarray:
-        """Change of each parameter that makes a clearly different push, (size,)."""
-        return np.tile([0.5, 0.3, 0.3] + [0.2] * self.bends, self.count)
+        """Change of each parameter that makes a clearly different push, (size,); a slider stays the same."""
+        return np.tile([0.5, 0.3, 0.3] + [0.2] * self.bends + [0.0] * self._chooses, self.count)
+
+    @property
+    def _chooses(self) -> bool:
+        """Whether there is a choice of sliders."""
+        return len(self.sliders) > 1
+
+    def pushed(self, parameters: Float[np.ndarray, "size"]) -> Int[np.ndarray, "count"]:
+        """Return the index of the slider that each push is made on."""
+        choice = parameters.reshape(self.count, -1)[:, -1] if self._chooses else np.zeros(self.count)
+        return np.array(self.sliders)[np.clip(choice, 0, len(self.sliders) - 1).astype(int)]
 
     def sample(self, key: PRNGKeyArray, candidates: int) -> np.ndarray:
         """Draw random pushes from all sides, (candidates, size)."""
-        low = np.tile([-np.pi, -0.8, 0.0] + [-0.2] * self.bends, self.count)
-        high = np.tile([np.pi, 0.8, 1.0] + [0.2] * self.bends, self.count)
+        low = np.tile([-np.pi, -0.8, 0.0] + [-0.2] * self.bends + [0.0] * self._chooses, self.count)
+        last = [float(len(self.sliders))] * self._chooses
+        high = np.tile([np.pi, 0.8, 1.0] + [0.2] * self.bends + last, self.count)
         return low + (high - low) * np.asarray(jax.random.uniform(key, (candidates, self.size)), np.float64)
 
     def check_hand(self, hand: Hand) -> None:
@@ -106,16 +128,16 @@ class PushSequence(eqx.Module):
             )
 
     def path(
-        self, numbers: Float[Array, "3+bends"], slider: Slider, hand: Hand, pose: Float[Array, "3"]
+        self, numbers: Float[Array, "numbers"], sliders: tuple[Slider, ...], hand: Hand, pose: Float[Array, "sliders 3"]
     ) -> Float[Array, "steps+1 dof"]:
-        """Return the path of the hand for one push.
+        """Return the path of the hand for one push, given the poses of all sliders, world."""
+        each = jnp.stack([self._path_on(numbers, sliders[k], hand, pose[k]) for k in self.sliders])
+        return each[jnp.clip(numbers[-1], 0, len(each) - 1).astype(int) if self._chooses else 0]
 
-        Args:
-            numbers: The numbers of the push.
-            slider: The slider.
-            hand: The hand.
-            pose: Pose of the slider in which the push is given, (3,), world.
-        """
+    def _path_on(
+        self, numbers: Float[Array, "numbers"], slider: Slider, hand: Hand, pose: Float[Array, "3"]
+    ) -> Float[Array, "steps+1 dof"]:
+        """Return the path of the hand for one push on one slider."""
         length = self.length * jnp.clip(numbers[2], 0, 1)
         ahead = jnp.stack([jnp.cos(numbers[0]), jnp.sin(numbers[0])])
         left = jnp.stack([-ahead[1], ahead[0]])
@@ -127,7 +149,7 @@ class PushSequence(eqx.Module):
         start, end = touch - self.clearance, touch + length
         along = jnp.concatenate([start[None], start + (end - start) * jnp.asarray(inner, start.dtype), end[None]])
         zero = jnp.zeros(1, start.dtype)
-        aside = jnp.concatenate([zero, numbers[3:] * length, zero])
+        aside = jnp.concatenate([zero, numbers[3 : 3 + self.bends] * length, zero])
         weights = jnp.asarray(_bernstein(self.bends + 1, self.steps), start.dtype)
         points = line[None] + (weights @ along)[:, None] * ahead[None] + (weights @ aside)[:, None] * left[None]
         points = se2.transform(pose, points)

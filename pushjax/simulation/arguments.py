@@ -34,7 +34,7 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.path import checked_path
 from pushjax.simulation.slider import Slider, fixture_overlaps, overlaps
-from pushjax.simulation.sliders_step import can_push, mutual_overlaps
+from pushjax.simulation.sliders_step import mutual_overlaps
 
 POSES_AT_ONCE = 4096  # poses whose overlaps are computed together
 # Numbers beyond these are probably in other units: length of a surface, m; distance of a hand from the origin, in
@@ -121,14 +121,25 @@ def checked_sliders_arguments(
     """Return the arguments of a rollout of several sliders, as above, with their friction (fingers, between)."""
     if not sliders:
         raise ValueError("slider: a tuple of sliders needs at least one; got none")
-    if between is None:
-        raise ValueError("between: several sliders need the coefficient of friction with each other; got None")
     for k, slider in enumerate(sliders):
         check_type(f"slider[{k}]", slider, Slider)
     dtype, count = common_dtype(tuple(sliders), hand, pose, friction, path, between), len(sliders)
     of_each = (pushes,) if pushes is not None and np.ndim(pose) == 3 else ()
     start = checked_array("pose", pose, (*of_each, count, 3), dtype)
-    mutual = as_float(between, dtype, "between")
+    mutual = checked_between(sliders, between, dtype)
+    each = [checked_rollout_arguments(s, hand, path, start[..., k, :], friction, pushes) for k, s in enumerate(sliders)]
+    sliders = tuple(one[0] for one in each)
+    check_start_beside_each_other(sliders, start)
+    # all are of the dtype of `start`
+    _, hand, path_array, _, mu = each[0]
+    return sliders, hand, path_array, start, (mu, mutual)
+
+
+def checked_between(sliders: Sequence[Slider], between: ArrayLike | None, dtype: Any) -> Array:
+    """Return the friction of sliders with each other, (sliders, sliders), checked where known."""
+    if between is None:
+        raise ValueError("between: several sliders need the coefficient of friction with each other; got None")
+    mutual, count = as_float(between, dtype, "between"), len(sliders)
     if mutual.shape not in ((), (count, count)):
         raise ValueError(f"between has shape {mutual.shape}; expected a scalar or ({count}, {count})")
     check_finite("between", mutual)
@@ -137,18 +148,23 @@ def checked_sliders_arguments(
     known = concrete(mutual)
     if known is not None and np.any(known != known.T):
         raise ValueError(f"between must be symmetric; got {known.tolist()}")
-    concave = [k for k, slider in enumerate(sliders) if not can_push(slider.shape)]
-    if len(concave) > 1:
-        raise ValueError(f"slider: of each two, one must be a disk or a convex polygon; sliders {concave} are not")
-    each = [checked_rollout_arguments(s, hand, path, start[..., k, :], friction, pushes) for k, s in enumerate(sliders)]
-    sliders = tuple(one[0] for one in each)
-    _check_start_beside_each_other(sliders, start)
-    # all are of the dtype of `start`
-    _, hand, path_array, _, mu = each[0]
-    return sliders, hand, path_array, start, (mu, mutual)
+    smooth = [k for k, slider in enumerate(sliders) if not isinstance(slider.shape, Disk | Polygon)]
+    if len(smooth) > 1:
+        raise ValueError(f"slider: of each two, one must be a disk or a polygon; sliders {smooth} are not")
+    return mutual
 
 
-def _check_start_beside_each_other(sliders: tuple[Slider, ...], poses: Array) -> None:
+def checked_friction_range(sliders: Sequence[Slider], between: Any, dtype: Any) -> Array:
+    """Return the lowest and highest friction of sliders with each other, (2, sliders, sliders), checked where known."""
+    low, high = between if np.shape(between) == (2,) else (between, between)  # the shape of None is ()
+    limits = jnp.stack([checked_between(sliders, each, dtype) for each in (low, high)])
+    known = concrete(limits)
+    if known is not None and np.any(known[0] > known[1]):
+        raise ValueError(f"between must be (lowest, highest); got ({float(low):g}, {float(high):g})")
+    return limits
+
+
+def check_start_beside_each_other(sliders: tuple[Slider, ...], poses: Array, name: str = "pose") -> None:
     """Raise ValueError if two sliders start too deep in each other, unless values are traced."""
     if traced((sliders, poses)) or is_staging() or len(sliders) < 2:
         return
@@ -159,8 +175,8 @@ def _check_start_beside_each_other(sliders: tuple[Slider, ...], poses: Array) ->
         first, second = [(i, j) for i in range(len(sliders)) for j in range(i)][pair]
         where = "" if poses.ndim == 2 else f" of push {push}"
         raise ValueError(
-            f"pose{where}: sliders {second} and {first} start inside each other, by {1e3 * depth[push, pair]:.3g} mm; "
-            f"at most {1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
+            f"{name}{where}: sliders {second} and {first} start inside each other, by {1e3 * depth[push, pair]:.3g} "
+            f"mm; at most {1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
         )
 
 

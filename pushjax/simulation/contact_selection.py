@@ -11,8 +11,6 @@ from jaxtyping import Array, Bool
 
 from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.polygon_outline import PolygonOutline
-from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import Candidates, Features, Touches, pick
 
 # Two candidates nearer to each other than this, in units of the limit surface's length, count as one. The first is for
@@ -25,18 +23,21 @@ SAME_DISTANCE = 1e-5
 
 
 def select_contacts(
-    candidates: Candidates, count: int, outline: Outline, length: Scalar, displacement: Vec2
+    candidates: Candidates,
+    count: int,
+    is_smooth: bool,  # whether the outline is no polygon
+    share_place: bool,  # whether two contacts may be at one place, as in an inner corner of a polygon
+    length: Scalar,
+    displacement: Vec2,
 ) -> Features:
     """Return the candidates that are contacts, the likeliest first, given how far the finger moves at each."""
     # distances are compared after the displacement of the finger, with the slider at rest
     candidates, length, displacement = jax.lax.stop_gradient((candidates, length, displacement))
     places = candidates.touches
     places = places._replace(distance=places.distance - places.normal.dot(displacement))
-    # in an inner corner of a polygon, two contacts are at one place
-    shares_place = isinstance(outline, PolygonOutline) and not outline.is_convex
-    separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
+    separation = SAME_BUMP if is_smooth else SAME_PLACE
     offset = places.point - _mean(places.point, places.exists)
-    preferred = places.distance - (0.0 if shares_place else SAME_DISTANCE) * jnp.sqrt(offset.dot(offset))
+    preferred = places.distance - (0.0 if share_place else SAME_DISTANCE) * jnp.sqrt(offset.dot(offset))
     # travel: how far the slider has to move to touch at each place while it stays in contact at those that are chosen
     eligible, travel = places.exists, jnp.zeros_like(preferred)
     chosen = [jnp.argmin(jnp.where(eligible, preferred, jnp.inf)).astype(jnp.int32)]
@@ -44,7 +45,7 @@ def select_contacts(
     for _ in range(count - 1):
         previous = pick(places, chosen[-1])
         differs, other = _distances_in_other_directions(places, previous, length)
-        if not shares_place:
+        if not share_place:
             offset = places.point - previous.point
             differs &= offset.dot(offset) > (separation * length) ** 2
         eligible, travel = compute_once((eligible & differs, jnp.maximum(travel, other)), places.distance[0])

@@ -13,7 +13,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from pushjax._math.vec import Vec2
+from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import ClosestPoint, Outline
@@ -25,24 +25,14 @@ from pushjax.simulation.pad_on_polygon import PadOnPolygon
 from pushjax.simulation.pair import Pair
 
 
-class RoundFingerPair(Pair):
-    """A round finger and any outline."""
+class DiskPair(Pair):
+    """A disk, which is the finger or the slider, and an outline."""
 
-    def count(self, outline):
-        return outline.max_touches
-
-    def distance(self, finger, outline, pose):
-        closest = outline.closest(pose.center)
-        return closest.distance - finger.radius, closest.normal
-
-    def pieces(self, finger, outline, pose):
-        distances, normals = outline.pieces(pose.center)
-        return distances - finger.radius, normals
-
-    def touches(self, finger, outline, pose, features):
-        places = outline.contact_candidates(pose.center)
+    def touches_of_disk(self, outline: Outline, center: Vec2, radius: Scalar) -> Touches:
+        """Return where a disk touches an outline: points on the outline, and normals out of it."""
+        places = outline.contact_candidates(center)
         all_places: ClosestPoint = jax.tree.map(lambda *entries: jnp.stack(entries), *places)
-        distance, point, normal = all_places.distance - finger.radius, all_places.point, -all_places.normal
+        distance, point, normal = all_places.distance - radius, all_places.point, all_places.normal
         # a second place that does not exist repeats the first
         differs = [entry != entry[:1] for entry in (point.x, point.y, normal.x, normal.y)]
         exists = functools.reduce(jnp.logical_or, differs).at[0].set(True)
@@ -66,26 +56,49 @@ class RoundFingerPair(Pair):
         return jax.tree.map(lambda entry: jnp.where(swaps, entry[::-1], entry), touches)
 
 
-class PadOnDisk(Pair):
+class RoundFingerPair(DiskPair):
+    """A round finger and any outline."""
+
+    def count(self, finger, outline):
+        return outline.max_touches
+
+    def distance(self, finger, outline, pose):
+        closest = outline.closest(pose.center)
+        return closest.distance - finger.radius, closest.normal
+
+    def pieces(self, finger, outline, pose):
+        distances, normals = outline.pieces(pose.center)
+        return distances - finger.radius, normals
+
+    def touches(self, finger, outline, pose, features):
+        touches = self.touches_of_disk(outline, pose.center, finger.radius)
+        return touches._replace(normal=-touches.normal)
+
+
+class PadOnDisk(DiskPair):
     """A pad and a disk."""
 
-    def count(self, outline):
-        return 1
+    def count(self, finger, outline):
+        return 1 if finger.shape.convex else 2
+
+    def are_convex(self, finger, outline):
+        return finger.shape.convex
 
     def distance(self, finger, outline, pose):
         closest = finger.shape.outline().closest((outline.center - pose.center).unrotate(pose.angle))
         return closest.distance - outline.radius, -closest.normal.rotate(pose.angle)
 
     def touches(self, finger, outline, pose, features):
-        distance, normal = self.distance(finger, outline, pose)
-        point = outline.center + normal.scale(outline.radius)
-        return jax.tree.map(lambda entry: entry[None], Touches(distance, point, -normal, features.present[0]))
+        center = (outline.center - pose.center).unrotate(pose.angle)
+        touches = self.touches_of_disk(finger.shape.outline(), center, outline.radius)
+        normal = touches.normal.rotate(pose.angle)
+        return touches._replace(point=outline.center - normal.scale(outline.radius), normal=normal)
 
 
 class WallPair(Pair):
     """A wall and any outline."""
 
-    def count(self, outline):
+    def count(self, finger, outline):
         return outline.max_rests
 
     def distance(self, finger, outline, pose):
@@ -124,4 +137,4 @@ def pair_of(finger: Finger | Wall, outline: Outline) -> Pair:
 
 def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
     """Return the number of contacts that a finger or a wall may have, which is static."""
-    return pair_of(finger, outline).count(outline)
+    return pair_of(finger, outline).count(finger, outline)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, checked_array, common_dtype, concrete
+from pushjax._internal.checks import ArrayLike, check_type, checked_array, common_dtype, concrete
 from pushjax._math.vec import Vec2
 from pushjax.geometry.disk import Disk
 from pushjax.geometry.polygon import Polygon
@@ -54,18 +54,19 @@ class Wall(eqx.Module):
 
 
 class Fixture(eqx.Module):
-    """A convex body that does not move.
+    """A body that does not move.
 
     The hand passes through fixtures; only the slider touches them.
 
     Args:
-        shape: A convex `Polygon` or a `Disk`, in its own frame, m. A body that is not convex is given as several.
+        shape: A `Polygon` or a `Disk`, in its own frame, m.
         pose: Pose of the body's frame, (3,), world, m and rad.
         friction: Coefficient of friction mu between body and slider.
 
     Raises:
-        ValueError: For a polygon that is not known to be convex, for another kind of shape, and for a wrong shape of
-            an array; where they are not traced, also for values that are not finite or a negative friction.
+        TypeError: For another kind of shape.
+        ValueError: For a wrong shape of an array; where they are not traced, also for values that are not finite or a
+            negative friction.
     """
 
     shape: Polygon | Disk
@@ -73,12 +74,7 @@ class Fixture(eqx.Module):
     friction: Float[Array, ""]
 
     def __init__(self, shape: Polygon | Disk, pose: ArrayLike = (0.0, 0.0, 0.0), friction: ArrayLike = 0.0):
-        convex = isinstance(shape, Disk) or (isinstance(shape, Polygon) and shape.convex)
-        if not convex:
-            raise ValueError(
-                f"shape: a fixture must be a Disk or a convex Polygon whose vertices are known; got "
-                f"{'a Polygon that is not convex' if isinstance(shape, Polygon) else type(shape).__name__}"
-            )
+        check_type("shape", shape, Polygon, Disk)
         dtype = common_dtype(shape, pose, friction)
         self.shape, self.pose = shape, checked_array("pose", pose, (3,), dtype)
         self.friction = checked_array("friction", friction, (), dtype, non_negative=True)

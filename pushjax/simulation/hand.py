@@ -31,22 +31,19 @@ class RoundFinger(eqx.Module):
 
 
 class Pad(eqx.Module):
-    """A finger that is a convex polygon.
+    """A finger that is a polygon.
 
     Attributes:
         shape: The polygon, in the finger's own frame, m.
 
     Raises:
         TypeError: For another shape than a polygon.
-        ValueError: For a polygon that is not known to be convex.
     """
 
     shape: Polygon
 
     def __init__(self, shape: Polygon):
         check_type("shape", shape, Polygon)
-        if not shape.convex:
-            raise ValueError("shape: a pad must be a convex polygon whose vertices are known")
         self.shape = shape
 
 
@@ -57,7 +54,7 @@ class Hand(eqx.Module):
     """A position-controlled hand: its fingers, and a map from configurations to their poses in the world.
 
     Args:
-        fingers: The fingers: numbers (radii of disks, m), `Polygon`s (convex pads, in the finger's own frame, m),
+        fingers: The fingers: numbers (radii of disks, m), `Polygon`s (pads, in the finger's own frame, m),
             `RoundFinger`s or `Pad`s.
         kinematics: Function from a configuration (dof,) to the poses (fingers, 3) of the fingers, world, m and rad; JAX
             traces it. A new function, such as a lambda that is made in a loop, compiles every program anew. For a hand

@@ -26,7 +26,7 @@ from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
 from pushjax.simulation.monte_carlo_tiles import Devices, Results, Rounds, Setup
-from pushjax.simulation.random_rollout import Distributions, checked_random_scene, shape_of
+from pushjax.simulation.random_rollout import Distributions, checked_random_scene, shape_and_surface
 from pushjax.simulation.slider import Slider
 
 TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
@@ -118,7 +118,8 @@ def monte_carlo(
         tile = batch_size or min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         used.gather(0)
-        distributions, shape = Distributions.of(scene.slider, model, limits), shape_of(scene.slider)
+        shape, surface = shape_and_surface(scene.slider)
+        distributions = Distributions.of(surface, model, limits)
         setup = Setup(typed_key, distributions, model, shape, scene.hand, solver, scene.table, scene.fixtures)
         rounds = Rounds(int(n), int(tile), setup, used, np.asarray(scene.start), np.asarray(scene.path), trajectories)
         results = _compute(rounds, scene.slider, checkpoint, report)

@@ -8,6 +8,8 @@ The first number of a contact's features is that of the corner or of the edge. T
 those that face the edge, or -1 for a corner.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -15,7 +17,7 @@ from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import Edge
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import Candidates, FingerPose, Touches, joined, pick
-from pushjax.simulation.pad_on_polygon import END_TOLERANCE, TILT_TOLERANCE, Corner
+from pushjax.simulation.pad_on_polygon import END_TOLERANCE, TILT_TOLERANCE, Corner, is_inside
 from pushjax.simulation.pair import MAX_PENETRATION, Pair
 
 CORNER = -1
@@ -24,8 +26,11 @@ CORNER = -1
 class PadOnCurve(Pair):
     """A pad and a smooth outline that is no disk."""
 
-    def count(self, outline):
+    def count(self, finger, outline):
         return 2
+
+    def are_convex(self, finger, outline):
+        return outline.is_convex and finger.shape.convex
 
     def distance(self, finger, outline, pose):
         pad = finger.shape.outline()
@@ -45,11 +50,13 @@ class PadOnCurve(Pair):
             corner.back.dot(closest.normal) >= -TILT_TOLERANCE
         )
         at_corners = Touches(closest.distance, closest.point, -closest.normal, faces & (closest.distance > too_deep))
-        places, _, along = jax.vmap(lambda edge: _places_on_edge(edge, outline, pose))(pad.edges)
+        places, local, along = jax.vmap(lambda edge: _places_on_edge(edge, outline, pose))(pad.edges)
         # A point past the end of an edge touches its corner.
         length_of_edge = pad.edges.length[:, None]
         tolerance = END_TOLERANCE[length_of_edge.dtype.itemsize] * length_of_edge
         within = (along >= -tolerance) & (along <= length_of_edge + tolerance) & (places.distance > too_deep)
+        if not pad.is_convex:  # a point that is behind an edge may be outside, at another one
+            within &= (places.distance >= -tolerance) | jax.vmap(jax.vmap(partial(is_inside, pad.edges)))(local)
         at_edges = places._replace(exists=places.exists & within)
         number, (edge, point) = jnp.arange(len(pad.edges.length)), jnp.indices(along.shape)
         of_edges = Candidates(at_edges, edge, point)

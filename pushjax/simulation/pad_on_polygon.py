@@ -52,8 +52,12 @@ class Corner(NamedTuple):
 class PadOnPolygon(Pair):
     """A pad and a polygon."""
 
-    def count(self, outline):
-        return 2 if outline.is_convex else 3  # three contacts constrain every motion in the plane
+    def count(self, finger, outline):
+        # three contacts constrain every motion in the plane
+        return 2 if self.are_convex(finger, outline) else 3
+
+    def are_convex(self, finger, outline):
+        return outline.is_convex and finger.shape.convex
 
     def distance(self, finger, outline, pose):
         pad = finger.shape.outline()
@@ -74,14 +78,18 @@ class PadOnPolygon(Pair):
         inverse_angle = Vec2(angle.x, -angle.y)
         local = slider_corners.turned(inverse_angle, (-pose.center).unrotate(angle))
         displacement = (-displacement_at(slider_corners.point)).unrotate(angle)
-        (place, edge, corner), _ = _vertex_edge_candidates(pad, local, displacement, length)
-        on_pad = Candidates(
-            place._replace(point=slider_corners.point, normal=-place.normal.rotate(angle)),
-            edge + outline.edges.length.size,
-            corner + pad.edges.length.size,
+        on_pad, on_next_of_pad = (
+            Candidates(
+                place._replace(point=slider_corners.point, normal=-place.normal.rotate(angle)),
+                edge + outline.edges.length.size,
+                corner + pad.edges.length.size,
+            )
+            for place, edge, corner in _vertex_edge_candidates(pad, local, displacement, length)
         )
-        # in an inner corner of the slider, a corner of the pad touches both edges
-        return joined(on_slider, on_pad) if outline.is_convex else joined(on_slider, on_pad, on_next_edge)
+        # in an inner corner of one body, a corner of the other touches both edges
+        more = [] if outline.is_convex else [on_next_edge]
+        more += [] if pad.is_convex else [on_next_of_pad]
+        return joined(on_slider, on_pad, *more)
 
     def touches(self, finger, outline, pose, features):
         pad, own = finger.shape.outline(), outline.edges
@@ -136,7 +144,7 @@ def _vertex_edge_candidates(
         )
         # A point that is behind an edge but not inside the polygon is on the far side of another edge. A point that is
         # deeper than twice the limit counts as on the far side, too.
-        behind = (height >= -tolerance) | (_is_inside(edge, corner.point) & (height > -2 * MAX_PENETRATION * length))
+        behind = (height >= -tolerance) | (is_inside(edge, corner.point) & (height > -2 * MAX_PENETRATION * length))
         touches = faces & (along >= begin) & (along <= end) & behind
         gap = jnp.maximum(jnp.where(touches, jnp.abs(height), jnp.inf), tolerance)
         lies_on = touches & (gap <= tolerance)
@@ -154,7 +162,7 @@ def _vertex_edge_candidates(
     return jax.vmap(two_nearest)(corner, own_displacement, jnp.arange(count, dtype=jnp.int32))
 
 
-def _is_inside(edge: Edge, point: Vec2) -> Bool[Array, ""]:
+def is_inside(edge: Edge, point: Vec2) -> Bool[Array, ""]:
     """Return whether a point lies inside a polygon: a ray along x crosses its outline an odd number of times."""
     below = edge.start.y <= point.y
     left = edge.normal.dot(point - edge.start) < 0
@@ -162,10 +170,22 @@ def _is_inside(edge: Edge, point: Vec2) -> Bool[Array, ""]:
 
 
 def _chord_depths(pad: PolygonOutline, slider_corners: Vec2) -> Scalar:
-    """Return the depth in the pad of the middle of the chord that it cuts from each of a slider's edges, m, or -inf."""
-    # The corners are in the pad's frame. Depth is concave along a chord, so the midpoint of a chord is at least half as
-    # deep as its deepest point.
+    """Return the depth in the pad of the middle of the chord that it cuts from each of a slider's edges, m."""
+    # The corners are in the pad's frame. The depth may be -inf where there is no chord. In a convex pad, depth is
+    # concave along a chord, so the midpoint of a chord is at least half as deep as its deepest point.
     side = pad.edges
+
+    def depth_in_pieces(start: Vec2, end: Vec2) -> Scalar:
+        """Return the depth of the deepest midpoint of all pieces into which the pad's outline cuts an edge."""
+        edge, offset = end - start, side.start - start
+        area = edge.cross(side.along)
+        area = jnp.where(area == 0, jnp.inf, area)
+        position, along = offset.cross(side.along) / area, offset.cross(edge) / area
+        cuts = (along >= 0) & (along <= side.length)
+        position = jnp.sort(jnp.where(cuts, jnp.clip(position, 0.0, 1.0), 1.0))
+        ends = jnp.pad(position, 1, constant_values=(0, 1))
+        middle = (ends[1:] + ends[:-1]) / 2
+        return -smallest(jax.vmap(pad.closest)(start + Vec2(edge.x * middle, edge.y * middle)).distance)
 
     def depth_of_chord(start: Vec2, end: Vec2) -> Scalar:
         first, last = (-side.normal.dot(corner - side.start) for corner in (start, end))
@@ -175,4 +195,5 @@ def _chord_depths(pad: PolygonOutline, slider_corners: Vec2) -> Scalar:
         depth = smallest(first + (enter + leave) / 2 * (last - first))
         return jnp.where(enter < leave, depth, -jnp.inf)
 
-    return jax.vmap(depth_of_chord)(slider_corners, jax.tree.map(lambda entry: jnp.roll(entry, -1), slider_corners))
+    next_corners = jax.tree.map(lambda entry: jnp.roll(entry, -1), slider_corners)
+    return jax.vmap(depth_of_chord if pad.is_convex else depth_in_pieces)(slider_corners, next_corners)

@@ -8,6 +8,7 @@ import jax
 from jaxtyping import Array, Float
 
 from pushjax._math.vec import Scalar, Vec2
+from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import Candidates, Features, FingerPose, Touches
 from pushjax.simulation.contact_selection import select_contacts
@@ -23,8 +24,12 @@ class Pair(ABC):
     """How fingers or walls of one kind meet outlines of one kind. All lengths are in m, in the slider's frame."""
 
     @abstractmethod
-    def count(self, outline: Outline) -> int:
+    def count(self, finger: Any, outline: Any) -> int:
         """Return the number of contacts."""
+
+    def are_convex(self, finger: Any, outline: Any) -> bool:
+        """Return whether both are known to be convex, so that a plane separates them where they are apart."""
+        return outline.is_convex
 
     @abstractmethod
     def distance(self, finger: Any, outline: Any, pose: FingerPose) -> tuple[Scalar, Vec2]:
@@ -33,7 +38,8 @@ class Pair(ABC):
     def pieces(self, finger: Any, outline: Any, pose: FingerPose) -> tuple[Float[Array, "pieces"], Vec2 | None]:
         """Return the distances to convex pieces of the slider, and the unit vectors from them; None if not known."""
         distance, normal = self.distance(finger, outline, pose)
-        return distance[None], jax.tree.map(lambda entry: entry[None], normal) if outline.is_convex else None
+        convex = self.are_convex(finger, outline)
+        return distance[None], jax.tree.map(lambda entry: entry[None], normal) if convex else None
 
     def candidates(
         self, finger: Any, outline: Any, pose: FingerPose, displacement_at: DisplacementAt, length: Scalar
@@ -46,11 +52,13 @@ class Pair(ABC):
     ) -> Features:
         """Return what meets at the contacts. It is not differentiated."""
         arguments = jax.lax.stop_gradient((finger, outline, pose))
-        candidates, count = self.candidates(*arguments, displacement_at, length), self.count(outline)
+        candidates, count = self.candidates(*arguments, displacement_at, length), self.count(finger, outline)
         if candidates is None:
             return Features.without_numbers(count)
         displacement = displacement_at(candidates.touches.point)
-        return select_contacts(candidates, count, outline, length, displacement)
+        is_smooth = not isinstance(outline, PolygonOutline)
+        share_place = not is_smooth and not self.are_convex(finger, outline)
+        return select_contacts(candidates, count, is_smooth, share_place, length, displacement)
 
     def matched(self, touches: Touches, at_start: Touches) -> Touches:
         """Return contacts in the order of those at the start of the step."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_key, check_type, concrete
+from pushjax._internal.checks import ArrayLike, check_key, check_type
 from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import entry_at
 from pushjax.contact.problem import form_and_friction
@@ -19,7 +19,7 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import Scene, checked_scene
+from pushjax.simulation.arguments import Scene, checked_friction_range, checked_scene
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import friction_on_table, simulate
@@ -64,11 +64,13 @@ class Distributions(NamedTuple):
     between: Array | None  # lowest and highest friction of several sliders with each other, (2, sliders, sliders)
 
     @staticmethod
-    def of(slider: Slider | tuple[Slider, ...], model: FrictionModel, between: Array | None) -> "Distributions":
-        """The distributions around the limit surfaces of one slider, or of several."""
-        if isinstance(slider, Slider):
-            return Distributions(model.around(slider.surface), None)
-        return Distributions(tuple(model.around(one.surface) for one in slider), between)
+    def of(
+        surface: LimitSurface | tuple[LimitSurface, ...], model: FrictionModel, between: Array | None
+    ) -> "Distributions":
+        """The distributions around the limit surface of one slider, or of several."""
+        if not isinstance(surface, tuple):
+            return Distributions(model.around(surface), None)
+        return Distributions(tuple(model.around(one) for one in surface), between)
 
 
 def draw(key: PRNGKeyArray, distributions: Distributions, model: FrictionModel, steps: int) -> Draws:
@@ -175,7 +177,8 @@ def random_rollout(
     check_key(key)
     check_type("model", model, FrictionModel)
     scene, limits = checked_random_scene(slider, hand, path, pose, between, solver, table, fixtures)
-    distributions, shape = Distributions.of(scene.slider, model, limits), shape_of(scene.slider)
+    shape, surface = shape_and_surface(scene.slider)
+    distributions = Distributions.of(surface, model, limits)
     given = scene.hand, scene.path, scene.start, model, solver, scene.table, scene.fixtures
     return _random_rollout(key, distributions, shape, *given)
 
@@ -184,23 +187,18 @@ def checked_random_scene(
     slider, hand, path, pose, between: Any, solver, table, fixtures, pushes: int | None = None
 ) -> tuple[Scene, Array | None]:
     """Return the arguments of a random rollout, and the lowest and highest friction between several sliders."""
-    is_range = np.shape(between) == (2,)  # that of None is ()
-    low, high = between if is_range else (between, between)
-    scene = checked_scene(slider, hand, path, pose, 0.0, high, solver, table, fixtures, pushes)
+    highest = between[1] if np.shape(between) == (2,) else between  # the shape of None is ()
+    scene = checked_scene(slider, hand, path, pose, 0.0, highest, solver, table, fixtures, pushes)
     if isinstance(scene.slider, Slider):
         return scene, None
-    if is_range:
-        least, most = (concrete(as_float(value, name="between")) for value in (low, high))
-        if least is not None and most is not None and not 0 <= least <= most:
-            raise ValueError(f"between must be (lowest, highest), not negative; got ({least:g}, {most:g})")
-    highest = scene.friction[1]
-    lowest = jnp.broadcast_to(as_float(low, highest.dtype, "between"), highest.shape)
-    return scene, jnp.stack([lowest, highest])
+    return scene, checked_friction_range(scene.slider, between, scene.start.dtype)
 
 
-def shape_of(slider: Slider | tuple[Slider, ...]) -> Shape | tuple[Shape, ...]:
-    """Return the outline of one slider, or of each of several."""
-    return slider.shape if isinstance(slider, Slider) else tuple(one.shape for one in slider)
+def shape_and_surface(slider: Slider | tuple[Slider, ...]) -> tuple[Any, Any]:
+    """Return the outline and the limit surface of one slider, or of each of several."""
+    if isinstance(slider, Slider):
+        return slider.shape, slider.surface
+    return tuple(one.shape for one in slider), tuple(one.surface for one in slider)
 
 
 @quick_jit

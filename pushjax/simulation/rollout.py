@@ -142,7 +142,7 @@ def rollout(
     `vmap` for batches.
 
     Args:
-        slider: The slider; or a tuple of several, each pair of which has a disk or a convex polygon.
+        slider: The slider; or a tuple of several, each pair of which has a disk or a polygon.
         hand: The hand.
         path: Configurations of the hand, (steps + 1, dof), world, m and rad (`line`, `resample` or any recording). The
             size of the steps sets the accuracy.
@@ -151,7 +151,7 @@ def rollout(
         solver: Solver of contact problems. The default suits every hand. Where several motions satisfy all contacts,
             the default takes the one that continues, if one does. `Exhaustive()` takes the one of largest power.
         table: A table whose friction depends on direction or place; None for uniform friction.
-        fixtures: Walls (`Wall`) and convex bodies (`Fixture`) that stay where they are, and that the slider may touch.
+        fixtures: Walls (`Wall`) and bodies (`Fixture`) that stay where they are, and that the slider may touch.
             Their contacts come after those of the fingers.
         between: Coefficient of friction of several sliders with each other, a scalar or (sliders, sliders).
 

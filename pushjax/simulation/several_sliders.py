@@ -22,7 +22,7 @@ from pushjax.simulation.sliders_step import (
     Meeting,
     compute_sliders_step,
     contact_counts,
-    depth_of_sliders,
+    depths_of_sliders,
     meetings_of,
     shortest,
 )
@@ -94,7 +94,7 @@ class PreparedSliders(NamedTuple):
     def first_state(self, pose: Vec3) -> PushState:
         """Return the state before the first trial."""
         bodies, meetings = self._first_meetings()
-        overlap = depth_of_sliders(bodies, meetings, pose, 0.0)
+        overlap = jnp.max(depths_of_sliders(bodies, meetings, pose, 0.0))
         contacts = sum(contact_counts(bodies, meetings))
         return first_state(pose, overlap, Start.none(contacts, jnp.zeros_like(overlap + pose.x)))
 
@@ -125,7 +125,7 @@ class PreparedSliders(NamedTuple):
         )
 
         def depth_at(pose: Vec3) -> Scalar:
-            return depth_of_sliders(bodies, meetings_of(bodies, part, fixtures), pose, 1.0)
+            return jnp.max(depths_of_sliders(bodies, meetings_of(bodies, part, fixtures), pose, 1.0))
 
         twist, is_smallest = record.twist, state.part < 2 * SMALLEST_PART
         speeds = [

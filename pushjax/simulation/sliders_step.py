@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.jit import quick_jit
-from pushjax._internal.xla import compute_once
+from pushjax._internal.xla import compute_once, map_items
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.sliders_solving import SlidersSolution, Start, Touching, solve_touching
@@ -34,6 +35,7 @@ from pushjax.simulation.step import (
     PushingPart,
     StepRecord,
     keep_pose_unless_moving,
+    roundoff_of,
     status_of,
 )
 
@@ -42,7 +44,7 @@ class Body(NamedTuple):
     """A slider: its outline, itself as a finger that pushes others, and its friction with each slider."""
 
     outline: Outline
-    finger: Finger | None  # None for a slider that is not convex, which cannot push another one that is not either
+    finger: Finger | None  # None for a smooth slider that is no disk, which cannot push another one of these
     center: Vec2  # of the finger, in the frame of the slider, m
     friction: Scalar  # with each slider, (sliders,)
 
@@ -53,9 +55,14 @@ class Body(NamedTuple):
         finger, center = None, Vec2(zero, zero)
         if isinstance(shape, Disk):
             finger, center = RoundFinger(shape.radius), Vec2.of(shape.center)
-        elif isinstance(shape, Polygon) and can_push(shape):
+        elif isinstance(shape, Polygon):
             finger = Pad(shape)
         return Body(shape.outline(), finger, center, friction)
+
+    @property
+    def rank(self) -> int:
+        """Where several sliders meet, the one of the lowest rank is best as a finger."""
+        return 2 if self.finger is None else int(not self.outline.is_convex)
 
     def as_finger(self, frame: BodyFrame, other: int) -> FingerMotion:
         """Return the slider as a finger of another one that stays where it is."""
@@ -63,11 +70,6 @@ class Body(NamedTuple):
         zero = jnp.zeros_like(frame.pose.x)
         center = frame.pose.xy + self.center.rotate(frame.angle)
         return FingerMotion(self.finger, self.friction[other], center, Vec2(zero, zero), frame.pose.z, zero)
-
-
-def can_push(shape: Shape) -> bool:
-    """Return whether a slider of this shape can be as a finger to others: whether it is a disk or a convex polygon."""
-    return isinstance(shape, Disk) or (isinstance(shape, Polygon) and shape.convex)
 
 
 class Meeting(NamedTuple):
@@ -116,8 +118,8 @@ def meetings_of(
     meetings += [Meeting(i, fixture, None, True) for i in range(count) for fixture in fixtures]
     for i in range(count):
         for j in range(i):
-            # the one that is not convex, if there is one, is the outline
-            first, second = (i, j) if bodies[j].finger is not None else (j, i)
+            # a smooth outline has to be the first, and fewer contacts are found if a disk or a convex one is second
+            first, second = (j, i) if bodies[j].rank > bodies[i].rank else (i, j)
             meetings.append(Meeting(first, None, second, True))
     return meetings
 
@@ -127,20 +129,22 @@ def contact_counts(bodies: tuple[Body, ...], meetings: list[Meeting]) -> list[in
     return [num_contacts(m.finger_of(bodies), bodies[m.slider].outline) for m in meetings]
 
 
-def depth_of_sliders(bodies: tuple[Body, ...], meetings: list[Meeting], pose: Vec3, fraction: float) -> Scalar:
-    """Return the depth of the deepest finger, fixture or slider in a slider after `fraction` of the step, m."""
+def depths_of_sliders(
+    bodies: tuple[Body, ...], meetings: list[Meeting], pose: Vec3, fraction: float
+) -> Float[Array, "meetings"]:
+    """Return the depth of each finger, fixture or slider in a slider after `fraction` of the step, m."""
     poses = tuple(Vec3(pose.x[i], pose.y[i], pose.z[i]) for i in range(len(bodies)))
     frames = tuple(BodyFrame.at(each) for each in poses)
-    depths = [
-        max_penetration(
+    items = tuple(
+        (
             bodies[m.slider].outline,
             (m.found_at(frames, bodies),),
             poses[m.slider],
-            0.0 if m.other is not None else fraction,
+            jnp.full_like(pose.x[0], 0.0 if m.other is not None else fraction),
         )
         for m in meetings
-    ]
-    return functools.reduce(jnp.maximum, depths)
+    )
+    return jnp.stack(map_items(lambda item: max_penetration(*item), items))
 
 
 @quick_jit
@@ -149,16 +153,13 @@ def mutual_overlaps(shapes: tuple[Shape, ...], poses: Array) -> Array:
     bodies = _without_friction(shapes, poses.dtype)
     pairs = meetings_of(bodies, (), ())
 
-    def depths_of(pose: Array) -> Array:
-        return jnp.stack([depth_of_sliders(bodies, [pair], Vec3.of(pose.T), 0.0) for pair in pairs])
-
-    return jax.vmap(depths_of)(poses)
+    return jax.vmap(lambda pose: depths_of_sliders(bodies, pairs, Vec3.of(pose.T), 0.0))(poses)
 
 
 def mutual_depth(shapes: tuple[Shape, ...], pose: Vec3) -> Scalar:
     """Return the depth of the two sliders that are deepest in each other, m; negative where all are apart."""
     bodies = _without_friction(shapes, pose.x.dtype)
-    return depth_of_sliders(bodies, meetings_of(bodies, (), ()), pose, 0.0)
+    return jnp.max(depths_of_sliders(bodies, meetings_of(bodies, (), ()), pose, 0.0))
 
 
 def _without_friction(shapes: tuple[Shape, ...], dtype: Any) -> tuple[Body, ...]:
@@ -173,7 +174,7 @@ class _PushingPart(NamedTuple):
     meetings: list[Meeting]
     starts: tuple[BodyFrame, ...]
     parts: list[PushingPart]  # of each slider
-    features: list[Features]  # of each meeting
+    features: tuple[Features, ...]  # of each meeting
     sizes: list[int]  # contacts of each meeting
     num_fingers: int
     ongoing: Bool[Array, ""] | bool
@@ -182,12 +183,12 @@ class _PushingPart(NamedTuple):
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
         meetings, bodies = self.meetings, self.bodies
         frames = self.moved(before, fraction)
-        found = [
-            self.parts[m.slider].contacts_of(
-                frames[m.slider], fraction, m.is_fixture, m.found_at(frames, bodies), own, old
-            )
-            for m, own, old in zip(meetings, self.features, before.at_start, strict=True)
-        ]
+        roundoff = roundoff_of(np.array([m.is_fixture for m in meetings]), fraction)
+        items = tuple(
+            (self.parts[m.slider], frames[m.slider], m.found_at(frames, bodies), *of_meeting)
+            for m, *of_meeting in zip(meetings, roundoff, self.features, before.at_start, strict=True)
+        )
+        found = map_items(lambda item: item[0].contacts_of(item[1], fraction, *item[2:]), items)
         contacts, at_start, near, past = zip(*found, strict=True)
         contact, exists = joined(*contacts), joined(*at_start).exists
         point, normal = joined(*[_in_second(m, each, frames) for m, each in zip(meetings, contacts, strict=True)])
@@ -246,12 +247,12 @@ def compute_sliders_step(
     """Compute one step of all fingers, or a part of one: its record, and the last stage."""
     meetings = meetings_of(bodies, motions, fixtures)
     starts = tuple(BodyFrame.at(Vec3(*each)) for each in zip(*pose, strict=True))
-    each = list(zip(bodies, starts, forms, strict=True))
-    instants = [time_of_impact(motions, body.outline, start, form.length) for body, start, form in each]
-    begin = compute_once(functools.reduce(jnp.minimum, instants), overlap_before)
-    parts = [PushingPart(body.outline, form.length, start, begin, 1 - begin, reach) for body, start, form in each]
-    found = [m.found_at(starts, bodies) for m in meetings]
-    features = [parts[m.slider].features_of(body) for m, body in zip(meetings, found, strict=True)]
+    each = tuple((body.outline, start, form.length) for body, start, form in zip(bodies, starts, forms, strict=True))
+    instants = map_items(lambda item: time_of_impact(motions, *item), each)
+    begin = compute_once(jnp.min(jnp.stack(instants)), overlap_before)
+    parts = [PushingPart(outline, length, start, begin, 1 - begin, reach) for outline, start, length in each]
+    items = tuple((parts[m.slider], m.found_at(starts, bodies)) for m in meetings)
+    features = map_items(lambda item: item[0].features_of(item[1]), items)
     sizes = contact_counts(bodies, meetings)
     part = _PushingPart(forms, bodies, meetings, starts, parts, features, sizes, len(motions), ongoing)
     before = _before(starts, sizes, guess, overlap_before)

@@ -24,13 +24,12 @@ angles of the outline's corners. `max_penetration` checks the result: it compute
 slider from the whole outline. `substeps` divides a step that is too long.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import compute_once, map_items, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
@@ -144,8 +143,8 @@ class PushingPart(NamedTuple):
         self,
         frame: BodyFrame,  # pose of the slider in this stage
         fraction: Scalar,  # of the pushing part that is done in this stage: zero in the predictor
-        is_fixture: bool,
         body: FingerMotion,
+        roundoff: Scalar,  # depth in which a body just touches, in units of the surface's length
         features: Features,
         at_start: Touches,  # not used in the predictor
     ) -> BodyContacts:
@@ -160,7 +159,7 @@ class PushingPart(NamedTuple):
         is_past = at_start.exists & ~touches.exists
         touches = tree_where(touches.exists, touches, at_start)
         # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
-        gap = _gap(at_start.distance, (DEPTH_FLOOR if is_fixture else TOUCHING[x.dtype.itemsize]) * self.length)
+        gap = _gap(at_start.distance, roundoff * self.length)
         displacement = body.material_displacement(frame, touches.point, pose.center, self.rest, in_predictor)
         displacement, friction = jax.tree.map(
             lambda entry: jnp.broadcast_to(entry, gap.shape), (displacement, body.friction)
@@ -169,15 +168,17 @@ class PushingPart(NamedTuple):
         is_near = jnp.any(at_start.exists & (gap <= self.reach))
         return BodyContacts(contacts, at_start, is_near, is_past)
 
+    def contacts_of_all(
+        self, frame: BodyFrame, fraction: Scalar, bodies: tuple[FingerMotion, ...], *others: Any
+    ) -> tuple[BodyContacts, ...]:
+        """Return the contacts of all bodies, in loops over similar ones; the other arguments have an entry for each."""
+        items = tuple(zip(bodies, *others, strict=True))
+        return map_items(lambda item: self.contacts_of(frame, fraction, *item), items)
 
-def _map_bodies(function, motions: tuple, fixtures: tuple, *others: tuple) -> tuple:
-    """Return `function(is_fixture, body, *others)` for each finger and each fixture, in loops over similar bodies."""
-    found = ()
-    for bodies, is_fixture in ((motions, False), (fixtures, True)):
-        items = tuple((body, *(other[len(found) + k] for other in others)) for k, body in enumerate(bodies))
-        if items:
-            found += map_items(lambda item, is_fixture=is_fixture: function(is_fixture, *item), items)
-    return found
+
+def roundoff_of(is_fixture: np.ndarray, like: Scalar) -> Float[Array, "bodies"]:
+    """Return the depth in which each body, a finger or a fixture, just touches, in units of the surface's length."""
+    return jnp.asarray(np.where(is_fixture, DEPTH_FLOOR, TOUCHING[like.dtype.itemsize]), like.dtype)
 
 
 def compute_step(
@@ -199,14 +200,15 @@ def compute_step(
     start = BodyFrame.at(pose)
     begin = compute_once(time_of_impact(motions, outline, start, form.length), pose.x)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
-    counts = [num_contacts(body.finger, outline) for body in motions + fixtures]
-    size, has_end = num_solved_together(counts), _has_end(motions + fixtures, counts)
-    features = _map_bodies(lambda _, body: part.features_of(body), motions, fixtures)
+    bodies = motions + fixtures
+    features, counts = map_items(part.features_of, bodies), [num_contacts(body.finger, outline) for body in bodies]
+    size, has_end = num_solved_together(counts), _has_end(bodies, counts)
+    roundoff = roundoff_of(np.arange(len(bodies)) >= len(motions), pose.x)
 
     def stage(before: Stage, fraction: Scalar) -> tuple[Stage, None]:
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
         frame = start.moved(before.middle, before.solution.twist.scale(fraction), before.angle)
-        found = _map_bodies(partial(part.contacts_of, frame, fraction), motions, fixtures, features, before.at_start)
+        found = part.contacts_of_all(frame, fraction, bodies, roundoff, features, before.at_start)
         contacts, at_start, near, past = zip(*found, strict=True)
         contacts, active = joined(*contacts), joined(*at_start).exists
         used_urgency, guess = before.urgency, before.solution.best
@@ -216,9 +218,8 @@ def compute_step(
             used_urgency = jnp.where((fraction == 0) & is_first_try, pressed, used_urgency)
         working = WorkingSet.most_urgent(used_urgency, size)
         works = before.solution.status <= Status.FREE  # else the step has failed, and the corrector solves nothing
-        tried = None if guess is None else working.local(guess)
-        solution = solve_problem(form, *working.select(contacts, active & ongoing & works), solver, tried)
-        solution = working.spread(solution)
+        chosen = *working.select(contacts, active & ongoing & works), solver
+        solution = working.spread(solve_problem(form, *chosen, None if guess is None else working.local(guess)))
         if guess is not None and solution.best is not None:
             solution = solution._replace(best=tree_where(solution.best.exists(), solution.best, guess))
         is_long = before.is_long | _turns_or_slips_too_far(contacts, active & has_end, solution, form.length)
@@ -238,9 +239,9 @@ def compute_step(
 
     before = Stage.before(start, counts, urgency, guess)
     last, _ = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
-    moved_pose = start.moved(last.middle, last.solution.twist, last.angle).pose
     status = status_of(last, motions, fixtures, overlap_before, form.length)
-    return keep_pose_unless_moving(last, moved_pose, pose, status), last
+    moved = start.moved(last.middle, last.solution.twist, last.angle).pose
+    return keep_pose_unless_moving(last, moved, pose, status), last
 
 
 def _holds(near: tuple[Bool[Array, ""], ...], num_fingers: int) -> Bool[Array, ""]:

@@ -15,7 +15,7 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.geometry.polygon import Polygon
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.several_sliders import SlidersFriction
-from pushjax.simulation.sliders_step import can_push, mutual_depth
+from pushjax.simulation.sliders_step import mutual_depth
 from pushjax.tasks.control_step import ControlStepResult, control_step_of_sliders
 from pushjax.tasks.environment import TaskState
 from pushjax.tasks.push_box import RADIUS
@@ -104,7 +104,7 @@ class PushClutter(TableTask):
         """Make parameters.
 
         Args:
-            block: The outline of every block, m, a convex polygon. Default: a rectangle of 0.06 by 0.04.
+            block: The outline of every block, m. Default: a rectangle of 0.06 by 0.04.
             between: Coefficient of friction of the blocks with each other.
             others: The other parameters of a `TableTask`.
 
@@ -112,12 +112,10 @@ class PushClutter(TableTask):
             The parameters. Their method `replace` changes fields.
 
         Raises:
-            ValueError: As for every `TableTask`, and for a block that is not convex.
+            ValueError: As for every `TableTask`.
             TypeError: As for every `TableTask`.
         """
         shape = Polygon.rectangle(*BLOCK) if block is None else block
-        if isinstance(shape, Polygon) and not can_push(shape):
-            raise ValueError("block must be a convex polygon; got one that is not")
         shared = vars(super().params(block=shape, **others))
         return ClutterParams(**shared, between=checked_array("between", between, (), non_negative=True))
 

@@ -9,9 +9,11 @@ from contact_batches import first, problems
 from scenes_of_sliders import Scenes, grid, pile, scenes, violations
 
 import pushjax as pj
+from pushjax.contact import near_contacts
+from pushjax.contact.near_contacts import solve_sliders
 from pushjax.contact.problem import contacts_in_columns
 from pushjax.contact.scaled_problem import ContactArrays, nondimensionalize
-from pushjax.contact.several_sliders import differentiable_motion, solve_sliders
+from pushjax.contact.several_sliders import differentiable_motion
 from pushjax.contact.sliders_problem import SlidersProblem
 from pushjax.contact.status import Status
 from pushjax.friction.polynomial import Polynomial
@@ -56,6 +58,24 @@ def test_every_condition_holds(kind, sliders, contacts, degree, alike):
 @pytest.mark.parametrize("kind", [pile, pytest.param(grid, marks=SLOW)])
 def test_float32(kind):
     moving(scenes(kind, 3, 14, SCENES, degree=2, seed=2), jnp.float32, missing=0.02)
+
+
+@SLOW
+def test_contacts_that_are_left_out_are_not_missed(monkeypatch):
+    """Half of the contacts are open, by more than is looked at first; many of them close."""
+    monkeypatch.setattr(near_contacts, "FAR", 0.05)
+    given = scenes(pile, 3, 9, SCENES, degree=2, seed=5)
+    rng, goal = np.random.default_rng(0), given.goal.copy()
+    opened = given.active & (rng.random(goal.shape[1:]) < 0.5)
+    goal[0] -= np.where(opened, rng.uniform(0, 1, opened.shape), 0)
+    given = given._replace(goal=goal)
+    motion = jax.jit(lambda given: solve_sliders(given), compiler_options=AS_USERS)(problem(given))
+    status = np.asarray(motion.status)
+    assert set(status) <= {Status.MOVING, Status.FREE}
+    error = violations(given, np.asarray(motion.twist), np.asarray(motion.force))
+    assert np.max(error[status == Status.MOVING]) < 1e-8
+    closed = np.any((goal[0] < -0.05) & (np.asarray(motion.force[0]) > 0), axis=0)
+    assert np.sum(closed) > 10
 
 
 def row_between(sliders: int, speeds: np.ndarray, friction: float = 0.3) -> Scenes:

@@ -30,7 +30,7 @@ def plan_of(status, path, pose, transits=(), samples=None, success=0.0):
     """A plan that needs no search."""
     samples, nothing = pose[None] if samples is None else samples, np.zeros(0)
     outcomes = Outcomes(samples, np.zeros(len(samples), bool))
-    return PushPlan(status, path, pose, transits, nothing, outcomes, success, 0.0, nothing)
+    return PushPlan(status, path, pose, transits, nothing, outcomes, np.zeros(len(path), int), success, 0.0, nothing)
 
 
 def push_through_the_middle(*_, pushes, finger, **__):
@@ -38,7 +38,9 @@ def push_through_the_middle(*_, pushes, finger, **__):
     path = np.linspace((-0.06, 0.0), (-0.02, 0.0), 13)[None]
     poses = np.array([(0.0, 0.0, 0.0), (0.03, 0.0, 0.0)])
     samples = poses + np.array([0.0, 1.0])[:, None] * np.linspace(-1e-3, 1e-3, 20)[:, None, None]
-    between = transits_between(BLOCK, RADIUS, float(pushes.clearance), path, poses, samples, np.array(finger))
+    between = transits_between(
+        [BLOCK], RADIUS, float(pushes.clearance), path, poses[:, None], samples[:, :, None], np.array(finger)
+    )
     return plan_of(PlanStatus.FOUND, path, poses, between.transits, samples, 1.0)
 
 
@@ -116,7 +118,9 @@ def test_without_a_transit_there_are_no_way_points(tmp_path, monkeypatch, capsys
 
     def into_the_notch(*_, pushes, **__):
         path, still = np.array([[(0.0, 0.02), (0.0, 0.0)]]), np.zeros((2, 3))
-        between = transits_between(notched, RADIUS, float(pushes.clearance), path, still, still[None])
+        between = transits_between(
+            [notched], RADIUS, float(pushes.clearance), path, still[:, None], still[None, :, None]
+        )
         return plan_of(PlanStatus.NO_TRANSIT, path, still, between.transits)
 
     monkeypatch.setattr(experiment, "plan_pushes", into_the_notch)
@@ -153,7 +157,7 @@ def test_fixtures_of_a_plan(tmp_path, monkeypatch, capsys):
         ("wall", "--fixtures: expected wall@X,Y,ANGLE"),
         ("wall@0,1", "--fixtures: expected wall@X,Y,ANGLE"),
         ("disc:0.02@0,1,0", "--fixtures: expected rectangle:"),
-        ("ellipse:0.02x0.01@0,1,0", "a body is a disk or a convex polygon; got 'ellipse:0.02x0.01@0,1,0'"),
+        ("ellipse:0.02x0.01@0,1,0", "a body is a disk or a polygon; got 'ellipse:0.02x0.01@0,1,0'"),
         ("disk:0.02@0,0,0", "start must be a pose at which the slider overlaps no fixture"),
     ],
 )

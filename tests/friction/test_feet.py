@@ -7,7 +7,7 @@ import pytest
 from compiling import AS_USERS
 
 import pushjax as pj
-from pushjax.contact.several_sliders import solve_sliders
+from pushjax.contact.near_contacts import solve_sliders
 from pushjax.contact.sliders_problem import SlidersProblem
 from pushjax.friction.feet import Feet
 from pushjax.friction.support_points import SupportPoints

@@ -5,6 +5,7 @@ import numpy as np
 import pushjax as pj
 from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.planning import PushScene, SpeedLimits, Workspace
+from pushjax.planning.between_pushes import Transits, transits_between
 
 L = np.array([(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.12), (0, 0.12)])
 PLUS = 0.03 * np.array(
@@ -25,3 +26,8 @@ def scene_of(shape=None, friction=FRICTION, fixtures=()):
 def poses_reaching(library, goal):
     """Return the pose from which each entry of a library reaches a goal."""
     return compose(goal, inverse(library.relative))
+
+
+def transits_around_one(vertices, radius, clearance, paths, poses, samples, **options) -> Transits:
+    """The transits around one slider: poses (pushes + 1, 3), samples (samples, pushes + 1, 3)."""
+    return transits_between([vertices], radius, clearance, paths, poses[:, None], samples[:, :, None], **options)

@@ -28,11 +28,10 @@ def star(rng):
 
 
 def fixed(rng):
-    """Return a random triangle, disk, thin bar, or now and then a wall far enough away to leave some room."""
+    """Return a random star or disk, a thin bar, or now and then a wall far enough away to leave some room."""
     pose, kind = np.array([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-3, 3)]), rng.choice(4, p=(0.35, 0.3, 0.25, 0.1))
     if kind == 0:
-        angle = 2 * np.pi * (np.arange(3) + rng.uniform(0, 0.6, 3)) / 3
-        return pj.Fixture(pj.Polygon(0.06 * np.stack([np.cos(angle), np.sin(angle)], axis=1)), pose)
+        return pj.Fixture(pj.Polygon(star(rng)), pose)
     if kind == 1:
         return pj.Fixture(pj.Disk(rng.uniform(0.005, 0.05), (0.01, 0.02)), pose)
     if kind == 2:
