@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import PolygonOutline
-from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import Candidates, Features, FingerPose, Touches
 from pushjax.simulation.contact_selection import select_contacts
 
