@@ -28,6 +28,8 @@ from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.friction_model import warn_about_percent
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
+from pushjax.geometry.disk import Disk
+from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
