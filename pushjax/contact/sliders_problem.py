@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from pushjax._math.linalg import solve
 from pushjax.contact.linear_patch import LinearPatch, Surface
 
 
@@ -165,7 +166,7 @@ class SlidersLCP(NamedTuple):
         reduced = matrix.at[:, :count].add(jnp.where(left, 2 * mu, 0.0)[None] * by_right)
         reduced = jnp.where(wanted[:, None] & wanted[None], reduced, jnp.eye(len(rows), dtype=right.dtype)[:, :, None])
         known = jnp.where(wanted, right[rows] + jnp.sum(by_right * rest[None], axis=1), 0.0)
-        found = jnp.linalg.solve(jnp.moveaxis(reduced, -1, 0), known.T[:, :, None])[:, :, 0].T
+        found = solve(reduced, known)
         force = jnp.where(left, 2 * mu * found[:count] - rest, found[count : 2 * count])
         found = found.at[count : 2 * count].set(force)
         slip = right[count : 2 * count] - jnp.sum(matrix[count : 2 * count] * found[None], axis=1)
