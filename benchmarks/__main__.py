@@ -22,7 +22,9 @@ from pushjax.cli.options import Output, parsed
 from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments._record import write_json
 
-TimedCase = Literal["push", "ellipsoid", "gradient", "grasp", "t", "hands", "solve", "sampling", "fit", "monte_carlo"]
+TimedCase = Literal[
+    "push", "ellipsoid", "gradient", "grasp", "t", "hands", "solve", "sampling", "fit", "monte_carlo", "several"
+]
 TIMED = {
     "push": "pushes of a square, 50 mm, in as few steps as 0.1 mm takes",
     "ellipsoid": "the same, with an ellipsoid for a limit surface",
@@ -34,6 +36,7 @@ TIMED = {
     "sampling": "random limit surfaces",
     "fit": "limit surfaces from 400 pairs",
     "monte_carlo": "pushes under random friction: a key in, a summary out",
+    "several": "a finger pushes one to three sliders in a row",
 }
 # Modules of the other cases. Each has `run`, whose arguments are the options, and `summary`; the first line of its
 # docstring is that of the list.
@@ -49,6 +52,7 @@ MODULES = (
     "numerics",
     "overlaps",
     "pusht",
+    "sliders",
     "solvers",
 )
 
@@ -72,7 +76,7 @@ def timed(
     Args:
         case: Which, of those that `python -m benchmarks` lists.
         dtype: Floating types. Default: both.
-        batch: How many at once. Default: 2000; fit 200; monte_carlo 2000 and 100 000.
+        batch: How many at once. Default: 2000; fit 200; several 256; monte_carlo 2000 and 100 000.
         cores: How many of the machine's cores may be used (Linux). Times of one core need --cores 1. Default: all.
         peers: push, grasp, fit, solve: also by MuJoCo and MJX, cvxpy, scipy: pip install '.[bench]'.
         baseline: A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did

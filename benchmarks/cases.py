@@ -102,6 +102,24 @@ def grasp_jaw(dtype: str, batch: int) -> Work:
     return Work("grasp_jaw", dtype, batch, MANY_STEPS, final_poses(one, batch), (pose, path))
 
 
+def push_row(dtype: str, batch: int, kind: str, count: int) -> Work:
+    """Make a program for the final poses of disks or squares in a row that nearly touch, pushed along it by 50 mm."""
+    steps, width, gap = 50, 0.06, 5e-4  # m
+    shape = pj.Disk(width / 2) if kind == "disks" else pj.Polygon.rectangle(width, width)
+    slider, hand = reference_push.cast((pj.Slider.uniform(shape, degree=2), pj.Hand.finger(0.005)), dtype)
+    path = pj.line(jnp.array([-0.036, 0.0], dtype), jnp.array([0.014, 0.0], dtype), steps)
+    scatter = jax.random.normal(jax.random.key(0), (batch, count, 3), dtype) * jnp.array([1e-5, 4e-3, 1e-2], dtype)
+    poses = scatter + (width + gap) * jnp.arange(count, dtype=dtype)[:, None] * jnp.array([1, 0, 0], dtype)
+    sliders, between = ((slider,) * count, jnp.asarray(0.2, dtype)) if count > 1 else (slider, None)
+
+    def one(pose: Any) -> pj.Trajectory:
+        friction = jnp.asarray(0.3, dtype)
+        return pj.rollout(sliders, hand, path, pose=pose, friction=friction, between=between)
+
+    poses = poses if count > 1 else poses[:, 0]
+    return Work(f"push_{count}_{kind}", dtype, batch, steps, jax.vmap(lambda pose: one(pose).pose[-1]), (poses,))
+
+
 def solve(dtype: str, batch: int, contacts: int) -> Work:
     """Make a program for the twists of random contact problems with `contacts` contacts."""
     draw = jax.vmap(lambda key: random_contacts_problem(key, contacts=contacts))

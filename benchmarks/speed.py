@@ -24,9 +24,10 @@ CASES: dict[str, tuple[Make, ...]] = {
     "sampling": (cases.sampling,),
     "fit": tuple(partial(cases.fit, degree=degree) for degree in (4, 2)),
     "monte_carlo": (cases.monte_carlo,),
+    "several": tuple(partial(cases.push_row, kind=kind, count=n) for kind in ("disks", "squares") for n in (1, 2, 3)),
 }
 BATCH = 2000
-BATCHES = {"fit": (200,), "monte_carlo": (2000, 100_000)}  # for cases with other batches
+BATCHES = {"fit": (200,), "monte_carlo": (2000, 100_000), "several": (256,)}  # for cases with other batches
 # A row that costs more than this factor times its baseline is a regression. Runs beside other programs scatter by 1.2.
 SLOWER = 1.5
 MOST_S = 20.0  # largest time of all runs of one row

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from compiling import AS_USERS
 from contact_batches import first, problems
-from scenes_of_sliders import Scenes, grid, pile, scenes, violations
 
 import pushjax as pj
+from benchmarks.scenes_of_sliders import Scenes, grid, pile, scenes, violations
+from benchmarks.sliders import jam_power, problem_of
 from pushjax.contact import near_contacts
 from pushjax.contact.near_contacts import solve_sliders
 from pushjax.contact.problem import contacts_in_columns
@@ -23,15 +24,9 @@ SLOW = pytest.mark.slow
 solve = jax.jit(solve_sliders, compiler_options=AS_USERS)
 
 
-def problem(given: Scenes, dtype=jnp.float64) -> SlidersProblem:
-    numbers = (jnp.asarray(x, dtype) for x in (given.surfaces(), given.rows, given.goal, given.friction))
-    table, rows, goal, friction = numbers
-    return SlidersProblem(Polynomial(table), rows, goal, friction, jnp.asarray(given.active))
-
-
 def moving(given: Scenes, dtype=jnp.float64, missing: float = 0.0) -> np.ndarray:
     """Check that the motion of every scene in which something pushes is found and right; return their status."""
-    motion = solve(problem(given, dtype))
+    motion = solve(problem_of(given, dtype))
     status, error = np.asarray(motion.status), violations(given, np.asarray(motion.twist), np.asarray(motion.force))
     pushed = np.any(given.active & (given.goal[0] > 0), axis=0)
     np.testing.assert_array_equal(status == Status.FREE, ~pushed)
@@ -69,7 +64,7 @@ def test_contacts_that_are_left_out_are_not_missed(monkeypatch):
     opened = given.active & (rng.random(goal.shape[1:]) < 0.5)
     goal[0] -= np.where(opened, rng.uniform(0, 1, opened.shape), 0)
     given = given._replace(goal=goal)
-    motion = jax.jit(lambda given: solve_sliders(given), compiler_options=AS_USERS)(problem(given))
+    motion = jax.jit(lambda given: solve_sliders(given), compiler_options=AS_USERS)(problem_of(given))
     status = np.asarray(motion.status)
     assert set(status) <= {Status.MOVING, Status.FREE}
     error = violations(given, np.asarray(motion.twist), np.asarray(motion.force))
@@ -103,7 +98,9 @@ def row_between(sliders: int, speeds: np.ndarray, friction: float = 0.3) -> Scen
 def test_pads_that_close_on_a_row_jam(dtype):
     # closing, both ahead at the same speed, the front one faster, the rear one leaving, and both apart
     speeds = np.array([[1.0, 1.0, 1.0, -0.5, -1.0], [0.9, 1.0, 1.1, -0.5, 1.0]])
-    motion = solve(problem(row_between(3, speeds), dtype))
+    given = row_between(3, speeds)
+    motion = solve(problem_of(given, dtype))
+    assert [jam_power(given, k) > 1e-9 for k in range(5)] == [True, False, False, False, False]
     expected = [Status.JAMMED, Status.MOVING, Status.MOVING, Status.MOVING, Status.FREE]
     np.testing.assert_array_equal(motion.status, expected)
     np.testing.assert_allclose(motion.twist[0, :, 1:4], np.broadcast_to([1.0, 1.0, -0.5], (3, 3)), atol=1e-5)
@@ -111,7 +108,7 @@ def test_pads_that_close_on_a_row_jam(dtype):
 
 
 def test_bad_numbers_make_one_example_invalid():
-    given = problem(scenes(pile, 3, 8, 6, degree=2, seed=3))
+    given = problem_of(scenes(pile, 3, 8, 6, degree=2, seed=3))
     good = solve(given)
     bad = given._replace(
         rows=given.rows.at[0, 0, 0, 0, 1].set(jnp.nan),
@@ -154,7 +151,7 @@ def test_one_slider_moves_as_by_the_solver_of_one(degree):
 
 @pytest.mark.parametrize("degree", [2, pytest.param(4, marks=SLOW)])
 def test_derivatives_are_those_of_the_motion(degree):
-    given = problem(scenes(pile, 3, 8, 40, degree=degree, seed=4))
+    given = problem_of(scenes(pile, 3, 8, 40, degree=degree, seed=4))
     keys = jax.random.split(jax.random.key(0), 4)
     changes = [jax.random.normal(key, x.shape) for key, x in zip(keys, jax.tree.leaves(given)[:4], strict=True)]
     change = given._replace(

@@ -81,8 +81,11 @@ def pile(rng: np.random.Generator, count: int) -> tuple[np.ndarray, list[Touch]]
     return center, touches
 
 
-def grid(rng: np.random.Generator, count: int) -> tuple[np.ndarray, list[Touch]]:
-    """Squares of a grid, face to face: pads or fingers from the left, in half of the scenes a wall above."""
+def grid(rng: np.random.Generator, count: int, closes: bool = False) -> tuple[np.ndarray, list[Touch]]:
+    """Squares of a grid, face to face: pads or fingers from the left, in half of the scenes a wall above.
+
+    If it `closes`, there are pads on the right too, most of which are slower or come toward the others.
+    """
     cells = [(0, 0)]
     while len(cells) < count:
         x, y = cells[rng.integers(len(cells))]
@@ -114,6 +117,9 @@ def grid(rng: np.random.Generator, count: int) -> tuple[np.ndarray, list[Touch]]
         else:
             point = center[i] + PERIOD * np.array([-0.5, rng.choice([0, rng.uniform(-0.5, 0.5)])])
             touches.append(Touch(i, -1, point, normal, velocity, common))
+    right, speed = max(x for x, _ in cells), rng.uniform(-1.2, 0.5)
+    for i in [i for i, (x, _) in enumerate(cells) if closes and x == right]:
+        face(i, -1, np.array([-1.0, 0.0]), np.array([-speed, 0.0]))
     top = max(y for _, y in cells)
     if rng.random() < 0.5:
         for i in [i for i, (_, y) in enumerate(cells) if y == top]:
