@@ -23,13 +23,14 @@ import pushjax as pj
 from benchmarks.scenes_of_sliders import Scenes, grid, pile, scenes, violations
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.contact.near_contacts import solve_sliders
+from pushjax.contact.several_sliders import SlidersMotion
 from pushjax.contact.sliders_problem import SlidersProblem
 from pushjax.experiments._record import result_record
 from pushjax.friction.polynomial import Polynomial
 
 ALLOWED = {"float64": 1e-8, "float32": 1e-3}  # largest relative violation that an answer may have
 LEAST_POWER = 1e-9  # of the forces of a jam, of sum one
-CHUNK, SCENES = 500, 10_000
+CHUNK, TILE, SCENES = 500, 20, 10_000  # scenes drawn together, solved together, and of each row
 KINDS: dict[str, Any] = {"pile": pile, "grid": grid, "alike": grid, "closing": partial(grid, closes=True)}
 # kind, sliders, contacts at most, degree of the limit surfaces
 ROWS = [
@@ -79,7 +80,7 @@ def run(
 
 
 def _row(kind: str, sliders: int, contacts: int, degree: int, dtype: str, chunks: int, seed: int) -> dict[str, Any]:
-    solve, elapsed, worst = jax.jit(lambda problem: solve_sliders(problem)), [], 0.0
+    solve, elapsed, worst = jax.jit(solve_in_tiles), [], 0.0
     counts = dict.fromkeys(("moving", "free", "jammed", "wrong", "not_converged"), 0)
     for chunk in range(chunks):
         own_seed, alike = seed + 1000 * chunk, kind == "alike"
@@ -113,7 +114,13 @@ def _row(kind: str, sliders: int, contacts: int, degree: int, dtype: str, chunks
     }
 
 
-def problem_of(given: Scenes, dtype: Any) -> SlidersProblem:
+def solve_in_tiles(problem: SlidersProblem) -> SlidersMotion:
+    """Solve the problems of a chunk, a few at once, as they are in a rollout."""
+    tiles = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, TILE), -2, 0), problem)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], -1), jax.lax.map(solve_sliders, tiles))
+
+
+def problem_of(given: Scenes, dtype: Any = jnp.float64) -> SlidersProblem:
     """Return the contact problem of scenes."""
     numbers = (jnp.asarray(x, dtype) for x in (given.surfaces(), given.rows, given.goal, given.friction))
     table, rows, goal, friction = numbers

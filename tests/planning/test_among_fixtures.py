@@ -182,7 +182,7 @@ def test_a_box_gets_around_fixtures():
     ):
         planner = PushPlanner(scene_of(fixtures=known), pushes, GOAL, TABLE, SPEEDS)
         made = PushController(planner, PositionControl())
-        found = episodes[name] = [play(made, *start, there) for start in starts(20)]
+        found = episodes[name] = [play(made, *start, there) for start in starts(12)]
         reached = [each.steps for each in found if each.success]
         print(
             f"{name}: {len(reached)} of {len(found)} in {np.mean(reached):.1f} steps; slider at places of fixtures "
@@ -190,6 +190,6 @@ def test_a_box_gets_around_fixtures():
             f"{1e3 * min(each.slider for each in found):.1f} and {1e3 * min(each.finger for each in found):.1f} mm"
         )
     knows, ignores, _ = episodes.values()
-    assert sum(each.success for each in knows) >= 19
+    assert sum(each.success for each in knows) >= 11
     assert all(each.slider > 0 and each.finger >= 0 for each in knows)
-    assert sum(each.success and each.slider > 0 and each.finger >= 0 for each in ignores) < 10
+    assert sum(each.success and each.slider > 0 and each.finger >= 0 for each in ignores) < 6

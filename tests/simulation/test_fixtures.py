@@ -84,14 +84,13 @@ def test_pushes_far_from_fixtures_are_those_without():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", [pj.Polygon.rectangle(0.03, 0.02), pj.Disk(0.014)])
-def test_a_body_that_is_not_convex_is_its_convex_parts(shape):
+def test_a_body_that_is_not_convex_is_its_convex_parts():
     """Pushed into the notch of a U, a slider moves as among the three bars that the U consists of."""
     bars = [((0.0, -0.024), (0.06, 0.012)), ((-0.024, 0.006), (0.012, 0.048)), ((0.024, 0.006), (0.012, 0.048))]
     corners = [(-30, -30), (30, -30), (30, 30), (18, 30), (18, -18), (-18, -18), (-18, 30), (-30, 30)]
     u = pj.Polygon(1e-3 * np.array(corners))
-    own, finger, place = pj.Slider(shape, pj.Ellipsoid(np.eye(3), 0.015)), pj.Hand.finger(0.004), jnp.array([0.1, 0.05])
+    own, finger = pj.Slider(pj.Polygon.rectangle(0.03, 0.02), pj.Ellipsoid(np.eye(3), 0.015)), pj.Hand.finger(0.004)
+    place = jnp.array([0.1, 0.05])
 
     def last(fixtures, way):
         start = place + jnp.array([0.0, 0.0235])
@@ -109,8 +108,7 @@ def test_a_body_that_is_not_convex_is_its_convex_parts(shape):
     difference = np.abs(found[0] - expected[0])[:, 1:] / np.array([1.0, 1.0, 1 / 0.015])
     assert np.max(difference[~jams]) < 1e-6
     assert np.max(difference) < np.linalg.norm(ways, axis=1).max() / 24 / 16  # a jam is located to a sixteenth
-    assert np.all(np.mean(jams, axis=1) > 0)
-    assert np.mean(jams) < 0.8
+    assert 0.2 < np.mean(jams) < 0.8
 
 
 def place_of(place, at):

@@ -124,7 +124,6 @@ def scattered(sliders, count: int, seed: int):
 @pytest.mark.parametrize(
     ("sliders", "dtype"),
     [
-        ((DISK, SQUARE, DISK), np.float64),
         ((T, SQUARE, DISK), np.float32),
         ((T, T), np.float64),
     ],

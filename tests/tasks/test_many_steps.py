@@ -1,4 +1,4 @@
-"""Half a million random control steps of PushT, half with each limit surface, in float32, under random friction."""
+"""A hundred thousand random control steps of PushT with each limit surface, in float32, under random friction."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 import pushjax as pj
 from pushjax.tasks import PushT
 
-BATCH, STEPS = 2048, 125
+BATCH, STEPS = 2048, 50
 
 
 @pytest.mark.slow
@@ -43,6 +43,6 @@ def test_everything_is_finite(degree):
     counts = dict(zip(pj.Status, np.asarray(statuses).sum(0).tolist(), strict=True))
     assert np.all(finite)
     assert sum(counts.values()) == BATCH * STEPS * env.substeps
-    assert counts[pj.Status.JAMMED] > 2_500
+    assert counts[pj.Status.JAMMED] > 1_000
     assert counts[pj.Status.INVALID] == 0
     assert counts[pj.Status.NOT_CONVERGED] < 1e-3 * BATCH * STEPS
