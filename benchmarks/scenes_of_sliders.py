@@ -117,9 +117,10 @@ def grid(rng: np.random.Generator, count: int, closes: bool = False) -> tuple[np
         else:
             point = center[i] + PERIOD * np.array([-0.5, rng.choice([0, rng.uniform(-0.5, 0.5)])])
             touches.append(Touch(i, -1, point, normal, velocity, common))
-    right, speed = max(x for x, _ in cells), rng.uniform(-1.2, 0.5)
-    for i in [i for i, (x, _) in enumerate(cells) if closes and x == right]:
-        face(i, -1, np.array([-1.0, 0.0]), np.array([-speed, 0.0]))
+    if closes:
+        right, velocity = max(x for x, _ in cells), np.array([rng.uniform(-0.5, 1.2), 0.0])
+        for i in [i for i, (x, _) in enumerate(cells) if x == right]:
+            face(i, -1, np.array([-1.0, 0.0]), velocity)
     top = max(y for _, y in cells)
     if rng.random() < 0.5:
         for i in [i for i, (_, y) in enumerate(cells) if y == top]:
